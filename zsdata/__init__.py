@@ -1,0 +1,1 @@
+"""zsdata: single photographs in, an endless, reproducible stream of stereo training pairs out."""
