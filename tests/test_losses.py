@@ -1,0 +1,238 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests import oracles_loss
+from tests.published import published_values
+from zsdata.losses import photometric_loss, sequence_weights, zero_stereo_loss
+from zsdata.sample import Masks
+from zsdata.synthesis.backward_warp import backward_warp
+
+
+def random_case(seed: int, patterns: tuple[str, str, str] = ("random",) * 3, batch: int = 2, size: tuple[int, int] = (5, 8), n: int = 3):
+    """Everything zero_stereo_loss takes, with labels that are not finite wherever the valid mask is False."""
+    rng = np.random.default_rng(seed)
+    shape = (batch, 1, *size)
+
+    def mask(pattern: str) -> torch.Tensor:
+        share = {"all": 1.0, "none": 0.0, "random": 0.5, "one": 0.0}[pattern]
+        values = rng.random(shape) < share
+        if pattern == "one":
+            values.flat[rng.integers(values.size)] = True
+        return torch.from_numpy(values)
+
+    masks = Masks(*map(mask, patterns))
+    disparity = torch.from_numpy(rng.uniform(0.1, 6, shape).astype(np.float32))
+    nothing = torch.from_numpy(rng.choice([np.nan, np.inf, -np.inf], shape).astype(np.float32))
+    images = [torch.from_numpy(rng.uniform(0, 255, (batch, 3, *size)).astype(np.float32)) for _ in range(2)]
+    predictions = [torch.from_numpy(rng.uniform(-2, 10, shape).astype(np.float32)).requires_grad_() for _ in range(n + 1)]
+    return {
+        "predictions": predictions[:n],
+        "left_clean": images[0],
+        "right_clean": images[1],
+        "disparity": torch.where(masks.valid, disparity, nothing),
+        "confidence": torch.from_numpy(rng.random(shape).astype(np.float32)),
+        "masks": masks,
+        "initial_prediction": predictions[n],
+    }
+
+
+def oracle(case: dict, gamma: float = 0.9, mu: float = 0.1, beta: float = 0.85, max_disparity: float = 700) -> float:
+    def flat(tensor: torch.Tensor) -> np.ndarray:
+        return tensor.detach().double().numpy()[:, 0] if tensor.dtype != torch.bool else tensor.numpy()[:, 0]
+
+    initial = case["initial_prediction"]
+    return oracles_loss.zero_stereo_loss(
+        [flat(prediction) for prediction in case["predictions"]],
+        case["left_clean"].double().numpy(),
+        case["right_clean"].double().numpy(),
+        *(flat(map_) for map_ in (case["disparity"], case["confidence"], *case["masks"])),
+        None if initial is None else flat(initial),
+        gamma,
+        mu,
+        beta,
+        max_disparity,
+    )
+
+
+PATTERNS = st.sampled_from(["all", "none", "random", "one"])
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    patterns=st.tuples(PATTERNS, PATTERNS, PATTERNS),
+    n=st.integers(1, 3),
+    initial=st.booleans(),
+    gamma=st.sampled_from([0.8, 0.9, 1.0]),
+    mu=st.sampled_from([0.0, 0.1, 2.0]),
+    beta=st.sampled_from([0.0, 0.85, 1.0]),
+    max_disparity=st.sampled_from([3.0, 700.0]),
+)
+def test_the_loss_is_the_papers_for_every_mask_and_its_gradient_is_finite(seed, patterns, n, initial, gamma, mu, beta, max_disparity):
+    case = random_case(seed, patterns, batch=1, n=n)
+    if not initial:
+        case["initial_prediction"] = None
+    options = {"gamma": gamma, "mu": mu, "beta": beta, "max_disparity": max_disparity}
+    loss, metrics = zero_stereo_loss(**case, **options)
+    assert loss.item() == pytest.approx(oracle(case, **options), rel=1e-4, abs=1e-5)
+    assert all(torch.isfinite(value) for value in metrics.values())
+    loss.backward()
+    for prediction in [*case["predictions"], *([case["initial_prediction"]] if initial else [])]:
+        assert torch.isfinite(prediction.grad).all()
+
+
+def test_the_loss_of_a_batch_is_the_papers():
+    case = random_case(7, batch=2)
+    loss, _ = zero_stereo_loss(**case)
+    assert loss.item() == pytest.approx(oracle(case), rel=1e-5)
+
+
+@pytest.fixture(scope="module")
+def published():
+    values = published_values("loss")
+    case = {
+        "predictions": list(values["predictions"]),
+        "left_clean": values["left"] * 255,
+        "right_clean": values["right"] * 255,
+        "disparity": values["disparity"],
+        "confidence": values["confidence"],
+        "masks": Masks(values["nonocclusion"], values["inpaint"], values["valid"]),
+    }
+    return values, case
+
+
+def test_the_published_loss_is_reproduced(published):
+    values, case = published
+    loss, metrics = zero_stereo_loss(**case)
+    assert loss.item() == pytest.approx(values["loss_sequence"].item(), abs=1e-5)
+    assert metrics["epe"].item() == pytest.approx(values["epe"].item(), abs=1e-5)
+
+
+def test_the_published_loss_with_an_initial_prediction_is_reproduced(published):
+    values, case = published
+    loss, metrics = zero_stereo_loss(**case, initial_prediction=values["initial"])
+    assert loss.item() == pytest.approx(values["loss_with_initial"].item(), abs=1e-5)
+    assert metrics["initial_term"].item() == pytest.approx((values["loss_with_initial"] - values["loss_sequence"]).item(), abs=1e-5)
+
+
+def test_the_published_photometric_map_is_reproduced(published):
+    values, _ = published
+    photometric = photometric_loss(values["left"], backward_warp(values["right"], values["disparity"]))
+    torch.testing.assert_close(photometric, values["photometric"], atol=1e-5, rtol=0)
+
+
+def test_sequence_weights_start_at_gamma_to_the_15th_and_end_at_one():
+    assert sequence_weights(1, 0.9) == [1.0]
+    for count in (2, 16, 22):
+        weights = sequence_weights(count, 0.9)
+        assert weights[0] == pytest.approx(0.9**15) and weights[-1] == 1.0
+        assert weights == sorted(weights)
+
+
+def test_each_mask_decides_where_a_prediction_is_pulled():
+    """The gradient reaches exactly the supervised pixels through the label, and no hidden or invented pixel through the photograph."""
+    case = random_case(3)
+    case["initial_prediction"] = None
+    loss, _ = zero_stereo_loss(**case, mu=0.0)
+    loss.backward()
+    assert torch.equal(case["predictions"][-1].grad != 0, case["masks"].valid)
+
+    nothing_known = random_case(3, ("random", "all", "none"))
+    loss, metrics = zero_stereo_loss(**nothing_known)
+    loss.backward()
+    assert loss.item() == 0 and metrics["photometric_term"] == 0
+    assert all((prediction.grad == 0).all() for prediction in nothing_known["predictions"])
+
+
+def test_labels_at_the_limit_do_not_supervise():
+    case = random_case(5, ("none", "none", "all"))
+    case["disparity"][0, 0, 0, 0] = 700.0
+    case["disparity"][0, 0, 0, 1] = 699.0
+    loss, _ = zero_stereo_loss(**case)
+    loss.backward()
+    grad = case["predictions"][-1].grad[0, 0, 0]
+    assert grad[0] == 0 and grad[1] != 0
+
+
+def test_metrics_are_of_the_last_prediction_over_valid_pixels():
+    shape = (1, 1, 8, 8)
+    valid = torch.ones(shape, dtype=torch.bool)
+    valid[..., 4:] = False
+    disparity = torch.full(shape, 5.0)
+    last = torch.full(shape, 5.0)
+    last[..., 0] += 2  # an eighth of the picture, a quarter of what is valid
+    last[..., 1] -= 4
+    last[..., 4:] = 100.0
+    images = torch.zeros(1, 3, 8, 8)
+    masks = Masks(valid, ~valid, valid)
+    _, metrics = zero_stereo_loss([last + 50, last], images, images, disparity, torch.ones(shape), masks)
+    assert metrics["epe"].item() == pytest.approx(1.5)
+    assert metrics["bad_1"].item() == pytest.approx(0.5) and metrics["bad_3"].item() == pytest.approx(0.25)
+    assert not any(value.requires_grad for value in metrics.values())
+
+
+def test_no_photometric_term_is_computed_when_mu_is_zero(monkeypatch):
+    monkeypatch.setattr("zsdata.losses.photometric_loss", lambda *_: pytest.fail("computed"))
+    zero_stereo_loss(**random_case(1), mu=0.0)
+
+
+def test_half_precision_predictions_are_judged_in_full_precision():
+    case = random_case(2)
+    case["initial_prediction"] = None
+    half = [prediction.detach().half() for prediction in case["predictions"]]
+    loss, _ = zero_stereo_loss(**{**case, "predictions": half})
+    expected, _ = zero_stereo_loss(**{**case, "predictions": [prediction.float() for prediction in half]})
+    assert loss.dtype == torch.float32 and torch.equal(loss, expected)
+
+
+def test_a_confidence_that_is_not_finite_is_harmless_where_the_label_is_invalid():
+    case = random_case(6)
+    case["disparity"] = torch.full_like(case["disparity"], 2.0)
+    case["confidence"] = torch.where(case["masks"].valid, case["confidence"], torch.nan)
+    loss, _ = zero_stereo_loss(**case)
+    case["confidence"] = case["confidence"].nan_to_num(0.0)
+    assert torch.equal(loss, zero_stereo_loss(**case)[0])
+
+
+def test_arguments_are_left_as_they_were():
+    case = random_case(4)
+    before = [case[name].clone() for name in ("left_clean", "right_clean", "disparity", "confidence")]
+    zero_stereo_loss(**case)[0].backward()
+    for name, copy in zip(("left_clean", "right_clean", "disparity", "confidence"), before, strict=True):
+        assert torch.equal(case[name].nan_to_num(), copy.nan_to_num())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda case: case.update(predictions=[]), "one or more"),
+        (lambda case: case.update(predictions=case["predictions"][0]), "list"),
+        (lambda case: case.update(disparity=case["disparity"][:, 0]), r"disparity is \[B, 1, H, W\]"),
+        (lambda case: case["predictions"].append(torch.zeros(2, 1, 5, 9)), r"predictions\[3\].*\[2, 1, 5, 9\]"),
+        (lambda case: case.update(confidence=torch.zeros(2, 3, 5, 8)), "confidence"),
+        (lambda case: case.update(left_clean=torch.zeros(2, 1, 5, 8)), "left_clean"),
+        (lambda case: case.update(right_clean=torch.zeros(2, 3, 5, 9)), "right_clean"),
+        (lambda case: case.update(masks=Masks(*(mask[:1] for mask in case["masks"]))), "masks.nonocclusion"),
+        (lambda case: case.update(initial_prediction=torch.zeros(1, 1, 5, 8)), "initial_prediction"),
+        (lambda case: case.update(gamma=0.0), "gamma"),
+        (lambda case: case.update(mu=-1.0), "mu"),
+        (lambda case: case.update(beta=1.5), "beta"),
+    ],
+)
+def test_what_does_not_fit_is_named(change, message):
+    case = random_case(0)
+    change(case)
+    with pytest.raises(ValueError, match=message):
+        zero_stereo_loss(**case)
+
+
+def test_a_mask_of_numbers_is_refused():
+    case = random_case(0)
+    case["masks"] = Masks(*(mask.float() for mask in case["masks"]))
+    with pytest.raises(TypeError, match=r"masks\.nonocclusion is bool"):
+        zero_stereo_loss(**case)
