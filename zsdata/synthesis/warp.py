@@ -123,8 +123,11 @@ def _resample_rows(left: Tensor, first: Tensor, second: Tensor, share: Tensor, j
     batch, channels, height, width = left.shape
     linked = torch.zeros((joined.shape[0], width + 1), device=left.device, dtype=torch.int64)
     linked[:, 1:-1] = joined  # linked[i]: pixels i - 1 and i are one surface; the frame's edges are torn
-    before = first - linked[:, :-1].reshape(-1).index_select(0, first)
-    after = second + linked[:, 1:].reshape(-1).index_select(0, second)
+    has_before = linked[:, :-1].reshape(-1).index_select(0, first)
+    has_after = linked[:, 1:].reshape(-1).index_select(0, second)
+    before, after = first - has_before, second + has_after
+    ends_before = (1 - has_before).to(left.dtype).reshape(batch, height, width)
+    ends_after = (1 - has_after).to(left.dtype).reshape(batch, height, width)
 
     t = share.reshape(batch, height, width)
     weight_before = ((2 - t) * t - 1) * t * 0.5
@@ -134,10 +137,11 @@ def _resample_rows(left: Tensor, first: Tensor, second: Tensor, share: Tensor, j
     planes = []
     for channel in range(channels):
         plane = left[:, channel].reshape(-1)
-        taps = [plane.index_select(0, tap).reshape(t.shape) for tap in (before, first, second, after)]
-        low, high = torch.minimum(taps[1], taps[2]), torch.maximum(taps[1], taps[2])
-        value = taps[0] * weight_before + taps[1] * weight_first + taps[2] * weight_second + taps[3] * weight_after
-        planes.append(torch.minimum(torch.maximum(value, low), high))
+        here, there, back, on = (plane.index_select(0, tap).reshape(t.shape) for tap in (first, second, before, after))
+        step = there - here
+        back, on = back - ends_before * step, on + ends_after * step  # past the end of a surface its colour goes on straight
+        value = back * weight_before + here * weight_first + there * weight_second + on * weight_after
+        planes.append(torch.minimum(torch.maximum(value, torch.minimum(here, there)), torch.maximum(here, there)))
     return torch.stack(planes, 1)
 
 

@@ -1,0 +1,76 @@
+"""Inpainters: from a name to a callable, and the loop that feeds it.
+
+An inpainter is anything with `__call__(right, inpaint_mask, generators) -> right`: right is float32 [B, 3, H, W] RGB 0..255, inpaint_mask bool [B, 1, H, W],
+True in the holes, and generators holds one numpy Generator per sample. One that wants to know more lists it in `needs` and gets it by keyword:
+`right_disparity` (float32 [B, 1, H, W], 0 in holes) or `background` (another photo of the same source at the crop's size, float32 [B, 3, H, W]).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+Inpainter = Callable[..., Tensor]
+
+
+def load_inpainter(inpaint: str | os.PathLike[str] | Inpainter, device: str | torch.device = "cpu", **options: Any) -> Inpainter:
+    """Turns the stream's `inpaint` argument into a callable `inpaint(right, inpaint_mask, generators) -> right`.
+
+    Args:
+        inpaint: "builtin"; "background" (MfS-Stereo's: another photo, colours matched); a Hub id or a local folder in the diffusers
+            format (needs the "diffusion" extra); or a callable, returned as it is.
+        device: where a network is put; the built-in inpainters follow their input.
+        options: of the diffusion inpainter, such as `steps`.
+    """
+    if callable(inpaint):
+        if options:
+            raise TypeError(f"a callable inpainter takes no options; got {sorted(options)}")
+        return inpaint
+    name = os.fspath(inpaint)
+    if name in ("builtin", "background"):
+        if options:
+            raise TypeError(f'inpaint="{name}" takes no options; got {sorted(options)}')
+        if name == "builtin":
+            from zsdata.synthesis.inpaint.builtin import BuiltinInpainter
+
+            return BuiltinInpainter()
+        from zsdata.synthesis.inpaint.background import RandomBackground
+
+        return RandomBackground()
+    from zsdata.synthesis.inpaint.diffusion import DiffusionInpainter
+
+    return DiffusionInpainter(name, device, **options)
+
+
+def fill(
+    inpainter: Inpainter,
+    right: Tensor,
+    inpaint_mask: Tensor,
+    generators: Sequence[np.random.Generator],
+    context: Mapping[str, Tensor],
+    micro_batch: int,
+) -> Tensor:
+    """`right` without holes: the inpainter's pixels in the holes, the known pixels as they are, `micro_batch` samples at a time.
+
+    A sample without a hole does not reach the inpainter. `context` holds what the inpainter's `needs` name.
+
+    Raises:
+        ValueError: where the inpainter returns another shape or values that are not finite.
+    """
+    filled = right.clone()
+    with_holes = inpaint_mask.flatten(1).any(1).nonzero().flatten().tolist()
+    for start in range(0, len(with_holes), micro_batch):
+        part = with_holes[start : start + micro_batch]
+        extra = {name: context[name][part] for name in getattr(inpainter, "needs", ())}
+        made = inpainter(right[part], inpaint_mask[part], [generators[i] for i in part], **extra)
+        if made.shape != right[part].shape:
+            raise ValueError(f"the inpainter must return {list(right[part].shape)}; got {list(made.shape)}")
+        if not torch.isfinite(made).all():
+            raise ValueError("the inpainter returned NaN or infinity; in half precision try bfloat16 or float32")
+        filled[part] = torch.where(inpaint_mask[part], made.float().clamp(0, 255), right[part])
+    return filled

@@ -1,0 +1,151 @@
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from tests.oracles import catmull_rom, warp_row
+from zsdata.synthesis.warp import forward_warp
+
+
+def warp_one_row(disparity, left=None):
+    disparity = torch.tensor(disparity, dtype=torch.float32).view(1, 1, 1, -1)
+    if left is None:
+        left = torch.arange(disparity.shape[-1], dtype=torch.float32).view(1, 1, 1, -1)
+    return forward_warp(left, disparity)
+
+
+def test_a_constant_disparity_shifts_the_photo():
+    left = torch.rand(2, 3, 4, 16)
+    warp = forward_warp(left, torch.full((2, 1, 4, 16), 5.0))
+    assert torch.equal(warp.right[..., :-5], left[..., 5:])
+    assert warp.inpaint_mask[..., -5:].all() and not warp.inpaint_mask[..., :-5].any()
+    assert not warp.nonocclusion_mask[..., :5].any() and warp.nonocclusion_mask[..., 5:].all()
+    assert torch.equal(warp.right_disparity[..., :-5], torch.full((2, 1, 4, 11), 5.0))
+    assert not warp.right[..., -5:].any() and not warp.right_disparity[..., -5:].any()
+
+
+def test_zero_disparity_leaves_the_photo_as_it_is():
+    left = torch.rand(1, 3, 5, 7)
+    warp = forward_warp(left, torch.zeros(1, 1, 5, 7))
+    assert torch.equal(warp.right, left)
+    assert warp.nonocclusion_mask.all() and not warp.inpaint_mask.any()
+
+
+def test_a_subpixel_shift_interpolates_between_the_two_pixels():
+    left = torch.rand(1, 1, 1, 32) * 255
+    warp = warp_one_row([3.25] * 32, left)
+    row = left.flatten().tolist()
+    for u in range(1, 27):
+        expected = catmull_rom(row[u + 2 : u + 6], 0.25)
+        low, high = sorted(row[u + 3 : u + 5])
+        assert warp.right[0, 0, 0, u].item() == pytest.approx(min(max(expected, low), high), abs=1e-3)
+
+
+@pytest.mark.parametrize("slope", [-0.9, -0.5, -0.1, 0.1, 0.5, 0.9])
+def test_a_slanted_plane_stays_whole_and_straight(slope):
+    x = np.arange(64)
+    disparity = 60 + slope * (x - 32) / 1.0 if slope < 0 else 5 + slope * x
+    warp = warp_one_row(disparity.tolist())
+    seen = ~warp.inpaint_mask.flatten()
+    columns = seen.nonzero().flatten()
+    assert seen[columns[0] : columns[-1] + 1].all(), "a crack in a continuous surface"
+    # Colour is the left column: the right view of a plane is a plane again.
+    u = torch.arange(64.0)
+    expected = u + warp.right_disparity.flatten()
+    inner = columns[1:-1]
+    assert torch.allclose(warp.right.flatten()[inner], expected[inner], atol=2e-3)
+
+
+def test_a_floating_square_hides_the_wall_on_its_left_and_uncovers_it_on_its_right():
+    left = torch.full((1, 3, 12, 40), 10.0)
+    left[..., 4:8, 20:28] = 200.0
+    disparity = torch.full((1, 1, 12, 40), 2.0)
+    disparity[..., 4:8, 20:28] = 9.0
+    warp = forward_warp(left, disparity)
+    row = warp.right[0, 0, 5]
+    assert (row[11:19] == 200).all() and row[10] == 10
+    assert warp.inpaint_mask[0, 0, 5].nonzero().flatten().tolist() == [*range(19, 26), 38, 39]
+    hidden = (~warp.nonocclusion_mask[0, 0, 5]).nonzero().flatten().tolist()
+    assert hidden == [0, 1, *range(13, 20)]
+
+
+def test_a_bar_thinner_than_its_disparity_leaves_a_hole_as_wide_as_itself():
+    disparity = [1.0] * 40
+    disparity[20:23] = [11.0] * 3
+    warp = warp_one_row(disparity)
+    assert warp.right.flatten()[9:12].tolist() == [20, 21, 22]
+    assert warp.inpaint_mask.flatten().nonzero().flatten().tolist() == [19, 20, 21, 39]
+    hidden = (~warp.nonocclusion_mask.flatten()).nonzero().flatten().tolist()
+    assert hidden == [0, 10, 11, 12]
+
+
+def test_the_nearer_surface_wins_even_where_the_farther_one_lands_closer_to_the_pixel():
+    disparity = [0.0] * 12
+    disparity[8] = 3.4  # lands on 4.6: covers pixel 5, half a pixel off, where the wall lands exactly
+    warp = warp_one_row(disparity)
+    assert warp.right.flatten()[5] == 8
+
+
+def test_no_colour_bleeds_across_a_depth_edge():
+    left = torch.where(torch.arange(64) < 32, 0.0, 255.0).view(1, 1, 1, -1)
+    disparity = torch.where(torch.arange(64) < 32, 3.3, 12.7).view(1, 1, 1, -1)
+    right = forward_warp(left, disparity).right
+    assert set(right.unique().tolist()) <= {0.0, 255.0}
+
+
+def scenes(values):
+    return arrays(np.float32, st.tuples(st.integers(1, 3), st.integers(1, 24)), elements=values)
+
+
+dyadic = st.integers(0, 96).map(lambda n: n / 8)  # many exact ties
+smooth = st.floats(0, 12, width=32)
+
+
+@settings(max_examples=300, deadline=None)
+@given(scenes(st.one_of(dyadic, smooth)) | scenes(dyadic) | scenes(st.sampled_from([0.0, 0.5, 1.0, 1.5, 2.0, 2.5])))
+def test_masks_and_disparity_equal_the_definitions(disparity):
+    warp = forward_warp(torch.zeros(1, 1, *disparity.shape), torch.from_numpy(disparity).view(1, 1, *disparity.shape))
+    for y, row in enumerate(disparity):
+        hole, right_disparity, visible = warp_row(row)
+        assert warp.inpaint_mask[0, 0, y].tolist() == hole.tolist()
+        assert np.allclose(warp.right_disparity[0, 0, y].numpy(), right_disparity, atol=1e-4)
+        differs = warp.nonocclusion_mask[0, 0, y].numpy() != visible
+        landing = np.round(row.astype(np.float64) * -1 + np.arange(len(row))).astype(int)
+        for x in np.flatnonzero(differs):  # only where "within 1 px" is a matter of rounding
+            assert abs(abs(right_disparity[landing[x]] - row[x]) - 1) < 1e-4
+
+
+def test_a_sample_is_the_same_in_any_batch_and_with_any_number_of_threads():
+    left, disparity = torch.rand(3, 3, 20, 50) * 255, torch.rand(3, 1, 20, 50) * 20
+    together = forward_warp(left, disparity)
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        for i in range(3):
+            alone = forward_warp(left[i : i + 1], disparity[i : i + 1])
+            for a, b in zip(alone, together, strict=True):
+                assert torch.equal(a[0], b[i])
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_a_value_that_is_no_number_covers_nothing():
+    disparity = [2.0] * 10
+    disparity[5], disparity[7] = float("nan"), float("inf")
+    warp = warp_one_row(disparity)
+    assert torch.isfinite(warp.right).all() and torch.isfinite(warp.right_disparity).all()
+    assert warp.inpaint_mask.flatten().nonzero().flatten().tolist() == [3, 5, 8, 9]
+    assert not warp.nonocclusion_mask.flatten()[[5, 7]].any()
+
+
+def test_colour_has_a_gradient():
+    left = torch.rand(1, 3, 4, 16, requires_grad=True)
+    forward_warp(left, torch.rand(1, 1, 4, 16) * 4).right.sum().backward()
+    assert left.grad is not None and torch.isfinite(left.grad).all() and left.grad.any()
+
+
+def test_shapes_that_do_not_fit_are_named():
+    with pytest.raises(ValueError, match=r"\[1, 3, 4, 5\] and \[1, 1, 4, 6\]"):
+        forward_warp(torch.zeros(1, 3, 4, 5), torch.zeros(1, 1, 4, 6))

@@ -1,0 +1,261 @@
+"""The loader: worker processes, the training device, and the place in the stream."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import cv2
+import torch
+from accelerate.state import GradientState
+from torch.utils.data import DataLoader, Dataset
+
+from zsdata.faults import FailureBudget, FaultLog
+from zsdata.finish import Finisher
+from zsdata.meter import Meter
+from zsdata.position import Position
+from zsdata.sample import StereoBatch
+from zsdata.worker import Prepared, Worker
+
+PREFETCHED_BATCHES = 2  # per worker, ready or in the making
+
+
+class StereoLoader:
+    """Finished batches on the device, for one rank; made by `ZeroStereoStream.loader`.
+
+    `iter(loader)` gives what is left of the current epoch and moves on to the next one at its end; a broken-off loop is continued where it
+    stopped. Global batch g of an epoch holds its samples [g R B, (g + 1) R B) for R ranks of batch B, so every rank sees the same number of
+    batches and no sample is given twice. It is no torch DataLoader: `Accelerator.prepare` leaves it alone, and it tells Accelerate itself when an
+    epoch ends, as gradient accumulation needs to know.
+
+    Not made for two loops at once: one loader has one place.
+    """
+
+    def __init__(
+        self,
+        *,
+        worker: Worker,
+        finisher: Finisher,
+        place: Callable[[], Position],
+        revision: Callable[[], int],
+        epoch_size: Callable[[int], int],
+        budget: FailureBudget,
+        problems: Mapping[str, int],
+        batch_size: int,
+        num_workers: int,
+        rank: int,
+        world_size: int,
+        multiprocessing_context: str | None,
+    ) -> None:
+        if batch_size < 1:
+            raise ValueError(f"batch_size is 1 or more; got {batch_size}")
+        if num_workers < 0:
+            raise ValueError(f"num_workers is 0 or more; got {num_workers}")
+        if not 0 <= rank < world_size:
+            raise ValueError(f"rank is in 0..world_size - 1; got rank {rank} of {world_size}")
+        self.batch_size = batch_size
+        self.rank = rank
+        self.world_size = world_size
+        self.device = finisher.device
+        self._worker = worker
+        self._finisher = finisher
+        self._place = place
+        self._revision = revision
+        self._epoch_size = epoch_size
+        self._num_workers = num_workers
+        self._context = multiprocessing_context
+        self._epoch = 0
+        self._samples = 0
+        self._pipeline: _Pipeline | None = None
+        self._faults = FaultLog(budget)
+        self._problems = dict(problems)
+        self._meter = Meter()
+        self._batches = 0
+        # What Accelerate's gradient state reads of the loader that is being iterated.
+        self.end_of_dataloader = False
+        self.remainder = -1
+        self._check_epoch(0)
+
+    def __len__(self) -> int:
+        """Batches that a rank is given in a whole epoch (the current one)."""
+        return self._epoch_size(self._epoch) // self._global_batch
+
+    @property
+    def epoch(self) -> int:
+        """The epoch that the next batch belongs to."""
+        return self._epoch
+
+    def __iter__(self) -> Iterator[StereoBatch]:
+        epoch = self._epoch
+        self._check_epoch(epoch)
+        gradient_state = GradientState()
+        gradient_state._add_dataloader(self)
+        self.end_of_dataloader = False
+        try:
+            while self._left(epoch, self._samples) > 0:
+                start = time.perf_counter()
+                prepared = self._next_prepared()
+                self._meter.seconds["wait"] += time.perf_counter() - start
+                batch = self._finisher(prepared, self._meter)
+                self._batches += 1
+                self._samples += self._global_batch
+                last = self._left(epoch, self._samples) == 0
+                if last:
+                    self._epoch, self._samples = epoch + 1, 0
+                self.end_of_dataloader = last
+                yield batch
+                if last or self._epoch != epoch:
+                    return
+        except Exception:
+            self.close()  # what was prefetched no longer follows the place
+            raise
+        finally:
+            gradient_state._remove_dataloader(self)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The place after the last batch given out: small, plain JSON, the same on every rank; prefetched batches do not count."""
+        place = self._place()
+        return Position(
+            seed=place.seed, epoch=self._epoch, samples=self._samples, manifest=place.manifest, configuration=place.configuration
+        ).to_state()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Goes to the place that `state_dict` named, with any number of ranks and workers and any batch size.
+
+        Raises:
+            ValueError: for a state of another stream; it names the field that differs.
+        """
+        place = Position.from_state(state, self._place())
+        self.close()
+        self._epoch, self._samples = place.epoch, place.samples
+        if not self._left(self._epoch, self._samples):  # a larger batch no longer fits into the rest of the epoch
+            self._epoch, self._samples = self._epoch + 1, 0
+
+    def stats(self) -> dict[str, Any]:
+        """What this rank has seen so far.
+
+        `batches`, `pairs`; `rejected`: photos refused, by reason; `examples`: (source, shard, key, reason) of the first ones; `shard_problems`: faults of
+        the shards themselves, by reason; `seconds`: time by stage, those of the workers added up over all of them, "wait" being how long
+        the training process stood still for lack of a prepared batch.
+        """
+        return {
+            "batches": self._batches,
+            "pairs": self._batches * self.batch_size,
+            "rejected": dict(self._faults.by_reason),
+            "examples": list(self._faults.examples),
+            "shard_problems": dict(self._problems),
+            "seconds": dict(self._meter.seconds),
+        }
+
+    def close(self) -> None:
+        """Ends the worker processes; the next iteration starts new ones."""
+        if self._pipeline is not None:
+            self._pipeline.close()
+            self._pipeline = None
+
+    def __enter__(self) -> StereoLoader:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    @property
+    def _global_batch(self) -> int:
+        return self.batch_size * self.world_size
+
+    def _left(self, epoch: int, samples: int) -> int:
+        """Global batches left of an epoch; what does not fill one is left out."""
+        return max(0, self._epoch_size(epoch) - samples) // self._global_batch
+
+    def _check_epoch(self, epoch: int) -> None:
+        size = self._epoch_size(epoch)
+        if size < self._global_batch:
+            raise ValueError(
+                f"epoch {epoch} has {size} samples, less than one batch of {self.batch_size} on each of {self.world_size} ranks; "
+                "lower batch_size, or set epoch_size to let photos repeat"
+            )
+
+    def _next_prepared(self) -> Prepared:
+        if self._pipeline is not None and self._pipeline.revision != self._revision():
+            self.close()  # the sources were swapped: what was prefetched may no longer be what the plan says
+        if self._pipeline is None:
+            self._pipeline = _Pipeline(
+                self._worker, self._requests(self._epoch, self._samples), self._num_workers, self.device, self._context, self._revision()
+            )
+        prepared = next(self._pipeline)
+        expected = self._indices(self._samples)
+        if [(meta["epoch"], meta["index"]) for meta in prepared.meta] != [(self._epoch, index) for index in expected]:
+            raise RuntimeError(f"expected samples {expected} of epoch {self._epoch}, got {prepared.meta}")
+        self._meter.seconds.update(prepared.seconds)
+        self._faults.add(len(prepared.meta), prepared.rejected)
+        return prepared
+
+    def _indices(self, samples: int) -> list[int]:
+        first = samples + self.rank * self.batch_size
+        return list(range(first, first + self.batch_size))
+
+    def _requests(self, epoch: int, samples: int) -> Iterator[list[tuple[int, int]]]:
+        """All batches of this rank from a place on, without end."""
+        while True:
+            while self._left(epoch, samples):
+                yield [(epoch, index) for index in self._indices(samples)]
+                samples += self._global_batch
+            epoch, samples = epoch + 1, 0
+            self._check_epoch(epoch)
+
+
+class _Samples(Dataset):
+    """What a DataLoader needs to know of a worker: (epoch, index) in, a prepared sample out."""
+
+    def __init__(self, worker: Worker) -> None:
+        self._worker = worker
+
+    def __getitem__(self, request: tuple[int, int]) -> Prepared:
+        return self._worker.prepare(*request)
+
+
+class _Pipeline:
+    """Prepared batches in the order of the requests; torch's DataLoader does the plumbing between the processes."""
+
+    def __init__(
+        self,
+        worker: Worker,
+        requests: Iterator[list[tuple[int, int]]],
+        num_workers: int,
+        device: torch.device,
+        context: str | None,
+        revision: int,
+    ) -> None:
+        self.revision = revision
+        several: dict[str, Any] = {}
+        if num_workers:
+            several = {
+                "prefetch_factor": PREFETCHED_BATCHES,
+                "multiprocessing_context": context,
+                "worker_init_fn": _use_one_thread,
+            }
+        loader = DataLoader(
+            _Samples(worker),
+            batch_sampler=requests,  # type: ignore[arg-type]  # any iterable of lists of what the dataset is asked for
+            num_workers=num_workers,
+            collate_fn=Prepared.stack,
+            pin_memory=device.type == "cuda",
+            **several,
+        )
+        self._batches = iter(loader)
+
+    def __next__(self) -> Prepared:
+        return next(self._batches)
+
+    def close(self) -> None:
+        shutdown = getattr(self._batches, "_shutdown_workers", None)
+        if shutdown is not None:
+            shutdown()
+
+
+def _use_one_thread(worker_id: int) -> None:
+    del worker_id
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+

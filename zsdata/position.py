@@ -1,0 +1,54 @@
+"""A place in the stream: all there is to save, and what is checked when it comes back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Position:
+    """Where a stream stands. The same on all ranks; `samples` counts what all ranks together have been given of `epoch`."""
+
+    seed: int
+    epoch: int
+    samples: int
+    manifest: str
+    configuration: str
+
+    def to_state(self) -> dict[str, Any]:
+        """Plain JSON."""
+        return {"version": VERSION, **asdict(self)}
+
+    @staticmethod
+    def from_state(state: Mapping[str, Any], expected: Position) -> Position:
+        """The place that `state` names, if it belongs to the stream at `expected`.
+
+        Raises:
+            ValueError: where a field is missing, of the wrong kind, or belongs to another stream; it names the field.
+        """
+        if not isinstance(state, Mapping):
+            raise ValueError(f"a stream's state is a dictionary as state_dict() returns it; got {type(state).__name__}")
+        names = {"version", *(field.name for field in fields(Position))}
+        if state.keys() != names:
+            raise ValueError(f"not a stream's state: missing {sorted(names - state.keys())}, unknown {sorted(map(str, state.keys() - names))}")
+        if state["version"] != VERSION:
+            raise ValueError(f"the state's version is {state['version']!r}; this zsdata reads version {VERSION}")
+        for name in ("epoch", "samples"):
+            if type(state[name]) is not int or state[name] < 0:
+                raise ValueError(f"the state's {name} must be an integer >= 0; got {state[name]!r}")
+        causes = {
+            "seed": "the stream's seed differs",
+            "manifest": "the photos, their order, the sources or epoch_size differ",
+            "configuration": "an option of the stream differs (size, depth, inpaint, disparity, view, augmentation, ...)",
+        }
+        for name, cause in causes.items():
+            if state[name] != getattr(expected, name):
+                raise ValueError(
+                    f"the state's {name} is {state[name]!r}, this stream's is {getattr(expected, name)!r}: {cause}. "
+                    "Open the stream as it was when the state was saved, or start anew without it."
+                )
+        return Position(**{name: state[name] for name in names - {"version"}})

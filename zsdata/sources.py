@@ -1,0 +1,118 @@
+"""Image sources: what the user names, found, weighed and put in order."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from zsdata.plan import EpochPlan, quotas_for
+from zsdata.source.manifest import Manifest, build_manifest
+
+
+@dataclass(frozen=True)
+class ImageSource:
+    """Tars of photos under one weight.
+
+    Args:
+        urls: a path or url, a pattern with braces ("shards/{000..099}.tar") or wildcards, or a list of such.
+        weight: share of the samples relative to the other sources; None weighs as many photos as it has.
+    """
+
+    urls: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
+    weight: float | None = None
+
+
+@dataclass(frozen=True)
+class SourceSet:
+    """The sources that are in use together, and the plan of their epochs."""
+
+    names: tuple[str, ...]
+    manifests: tuple[Manifest, ...]
+    plan: EpochPlan
+
+
+class Schedule:
+    """Which sources are in use in which epoch.
+
+    Args:
+        sources: as `ZeroStereoStream` takes them: urls, a list of urls, {name: ImageSource or urls}, or {first epoch: any of these}.
+        seed, epoch_size: as `ZeroStereoStream` takes them.
+    """
+
+    def __init__(self, sources: Any, seed: int, epoch_size: int | None) -> None:
+        self._seed = seed
+        self._epoch_size = epoch_size
+        self._manifests: dict[str, Manifest] = {}
+        by_epoch = _by_epoch(sources)
+        self._starts = sorted(by_epoch)
+        self._sets = [self._open(by_epoch[start]) for start in self._starts]
+
+    def at(self, epoch: int) -> SourceSet:
+        """The sources of `epoch`."""
+        return self._sets[bisect_right(self._starts, epoch) - 1]
+
+    def swap(self, epoch: int, sources: Any) -> None:
+        """Uses `sources` from `epoch` on; what was planned for later epochs is dropped."""
+        if isinstance(sources, Mapping) and sources and all(isinstance(key, int) for key in sources):
+            raise ValueError("set_sources takes the sources of the coming epochs; give a schedule {epoch: sources} to the stream itself")
+        opened = self._open(sources)
+        kept = [i for i, start in enumerate(self._starts) if start < epoch]
+        self._starts = [*(self._starts[i] for i in kept), epoch]
+        self._sets = [*(self._sets[i] for i in kept), opened]
+
+    @property
+    def problems(self) -> list[Any]:
+        """What was wrong with the shards, over all sources."""
+        return [problem for manifest in self._manifests.values() for problem in manifest.problems]
+
+    @property
+    def digest(self) -> str:
+        """Changes with any photo, source name, quota or epoch at which sources are swapped."""
+        content = [
+            (start, sources.names, sources.plan.quotas, [manifest.digest for manifest in sources.manifests])
+            for start, sources in zip(self._starts, self._sets, strict=True)
+        ]
+        return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+
+    def _open(self, sources: Any) -> SourceSet:
+        named = _by_name(sources)
+        manifests = tuple(self._manifest(source.urls) for source in named.values())
+        sizes = tuple(len(manifest) for manifest in manifests)
+        quotas = quotas_for(sizes, [source.weight for source in named.values()], self._epoch_size)
+        return SourceSet(tuple(named), manifests, EpochPlan(self._seed, tuple(named), sizes, quotas))
+
+    def _manifest(self, urls: Any) -> Manifest:
+        key = repr(urls)
+        if key not in self._manifests:
+            self._manifests[key] = build_manifest(urls)
+        return self._manifests[key]
+
+
+def _by_epoch(sources: Any) -> dict[int, Any]:
+    if not isinstance(sources, Mapping):
+        return {0: sources}
+    if not sources:
+        raise ValueError("sources is empty; name at least one tar of photos")
+    kinds = {type(key) for key in sources}
+    if kinds == {str}:
+        return {0: sources}
+    if kinds != {int}:
+        raise TypeError(f"the keys of sources are all names or all epochs; got {list(sources)}")
+    if min(sources) != 0:
+        raise ValueError(f"a schedule of sources begins with epoch 0; got epochs {sorted(sources)}")
+    return dict(sources)
+
+
+def _by_name(sources: Any) -> dict[str, ImageSource]:
+    if not isinstance(sources, Mapping):
+        sources = {"photos": sources}
+    if not sources:
+        raise ValueError("sources is empty; name at least one tar of photos")
+    if not all(isinstance(name, str) for name in sources):
+        raise TypeError(f"the sources of an epoch are named by strings; got {list(sources)}")
+    return {name: source if isinstance(source, ImageSource) else ImageSource(source) for name, source in sources.items()}

@@ -1,0 +1,250 @@
+"""ZeroStereoStream: photos in tars, named once; stereo pairs out, for as long as a matcher trains."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from typing import Any
+
+import torch
+from torch.utils.data import IterableDataset, get_worker_info
+
+from zsdata.augment import AugmentConfig
+from zsdata.faults import FailureBudget, FaultLog
+from zsdata.finish import Finisher
+from zsdata.loader import StereoLoader
+from zsdata.meter import Meter
+from zsdata.position import Position
+from zsdata.sample import StereoBatch
+from zsdata.sources import Schedule
+from zsdata.synthesis.depth import DepthEstimator
+from zsdata.synthesis.disparity import AdaptiveDisparity, UniformDisparity
+from zsdata.synthesis.inpaint import Inpainter, load_inpainter
+from zsdata.synthesis.synthesizer import SynthesisConfig
+from zsdata.synthesis.view import ViewConfig
+from zsdata.worker import Prepared, Recipe, Worker, single_thread
+
+logger = logging.getLogger("zsdata")
+
+SMALLEST_CROP_PX = 32
+
+
+class ZeroStereoStream(IterableDataset):
+    """An endless, reproducible stream of stereo pairs made from single photos (ZeroStereo, ICCV 2025).
+
+    Sample i of epoch e is a function of (seed, e, i), the photos and these arguments, and of nothing else: not of the number of workers or
+    ranks, the batch size, or what was drawn before. Iterating the stream itself gives the finished pairs of one epoch on the CPU, and of the
+    next one when iterated again; `loader` gives finished batches on a device, made ahead by worker processes.
+
+    Inside a torch DataLoader with workers each worker makes its share of the samples. There, torch copies the stream to new workers for every
+    epoch, so say which epoch it is: `stream.set_epoch(epoch)`; with `persistent_workers=True` the workers count for themselves.
+
+    Args:
+        sources: tars of photos: a path, url or pattern ("shards/{000..099}.tar"), a list of such, named and weighted sources
+            ({"indoor": ImageSource("in.tar", weight=0.7), "street": ImageSource("out.tar", weight=0.3)}), or any of these by the epoch from which
+            they are used ({0: "first.tar", 5: "second.tar"}).
+        size: (height, width) of the pairs, in pixels.
+        depth: "builtin", a Hub id or folder in the transformers format, or a callable (see `load_depth`).
+        inpaint: "builtin", "background", a Hub id or folder in the diffusers format, or a callable (see `load_inpainter`).
+        disparity: how far apart the cameras stand: AdaptiveDisparity (the paper's) or UniformDisparity (MfS-Stereo's).
+        seed: an integer >= 0.
+        epoch_size: samples per epoch; None is one exact pass over the photos, whatever their sources' weights.
+        view, synthesis, augmentation: configurations of these steps; `AugmentConfig.none()` leaves the pairs as they are.
+        budget: how many photos may be refused before the run stops.
+
+    Raises:
+        ValueError, TypeError, FileNotFoundError: at once, for an argument that cannot work.
+    """
+
+    def __init__(
+        self,
+        sources: Any,
+        *,
+        size: tuple[int, int] = (384, 512),
+        depth: str | os.PathLike[str] | DepthEstimator = "builtin",
+        inpaint: str | os.PathLike[str] | Inpainter = "builtin",
+        disparity: AdaptiveDisparity | UniformDisparity | None = None,
+        seed: int = 0,
+        epoch_size: int | None = None,
+        view: ViewConfig | None = None,
+        synthesis: SynthesisConfig | None = None,
+        augmentation: AugmentConfig | None = None,
+        budget: FailureBudget | None = None,
+    ) -> None:
+        super().__init__()
+        if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+            raise ValueError(f"seed is an integer >= 0; got {seed!r}")
+        if len(size) != 2 or not all(isinstance(side, int) and side >= SMALLEST_CROP_PX for side in size):
+            raise ValueError(f"size is (height, width) in pixels, each {SMALLEST_CROP_PX} or more; got {size!r}")
+        self._schedule = Schedule(sources, seed, epoch_size)
+        self._revision = 0
+        self._problems = Counter(problem.reason.split(":")[0] for problem in self._schedule.problems)
+        if self._problems:
+            first = self._schedule.problems[0]
+            logger.warning(
+                "%d faults in the shards (%s), the first: %s; `zsdata verify` lists them",
+                self._problems.total(), ", ".join(f"{reason}: {count}" for reason, count in self._problems.most_common()), first,
+            )
+        self._inpaint = inpaint if callable(inpaint) else os.fspath(inpaint)
+        self._augmentation = augmentation if augmentation is not None else AugmentConfig()
+        self._budget = budget if budget is not None else FailureBudget()
+        inpainter = load_inpainter(self._inpaint) if callable(inpaint) or self._inpaint in ("builtin", "background") else None
+        self._recipe = Recipe(
+            seed=seed,
+            size=(int(size[0]), int(size[1])),
+            schedule=self._schedule,
+            depth=depth if callable(depth) else os.fspath(depth),
+            disparity=disparity if disparity is not None else AdaptiveDisparity(),
+            view=view if view is not None else ViewConfig(),
+            synthesis=synthesis if synthesis is not None else SynthesisConfig(),
+            inpainter_needs=tuple(getattr(inpainter, "needs", ())),
+        )
+        self._worker = Worker(self._recipe)
+        self._cpu_finisher: Finisher | None = None
+        self._faults = FaultLog(self._budget)
+        self._meter = Meter()
+        self._epoch = 0
+        self._samples = 0
+
+    def __len__(self) -> int:
+        """Samples in the epoch that comes next."""
+        return self.epoch_size(self._epoch)
+
+    def epoch_size(self, epoch: int) -> int:
+        """Samples in `epoch`."""
+        return self._schedule.at(epoch).plan.epoch_size
+
+    def __iter__(self) -> Iterator[StereoBatch]:
+        """The finished pairs of an epoch, on the CPU, without a batch axis; from where the last loop stopped."""
+        info = get_worker_info()
+        first, step = (info.id, info.num_workers) if info else (0, 1)
+        epoch = self._epoch
+        for index in range(self._samples + first, self.epoch_size(epoch), step):
+            pair = self._make(epoch, index)
+            self._samples += step
+            yield pair
+            if self._epoch != epoch:
+                return  # another loop or a set_epoch has moved the stream on
+        self._epoch, self._samples = epoch + 1, 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """The next loop over the stream gives this epoch, from its first sample."""
+        if epoch < 0:
+            raise ValueError(f"an epoch is 0 or more; got {epoch}")
+        self._epoch, self._samples = epoch, 0
+
+    def set_sources(self, sources: Any, *, epoch: int) -> None:
+        """Uses other sources from `epoch` on; loaders follow by themselves.
+
+        A state saved afterwards belongs to the stream with this swap in it: before resuming, swap again or give the schedule
+        {0: ..., epoch: ...} from the start.
+        """
+        if epoch < 1:
+            raise ValueError(f"sources can be swapped from epoch 1 on; got {epoch}. For epoch 0 give them to the stream itself.")
+        self._schedule.swap(epoch, sources)
+        self._revision += 1
+
+    def replay(self, epoch: int, index: int) -> StereoBatch:
+        """One sample again, just as training saw it: a finished pair on the CPU; `meta` says where it came from."""
+        if epoch < 0:
+            raise IndexError(f"an epoch is 0 or more; got {epoch}")
+        return self._finish(self._worker.prepare(epoch, index))
+
+    def loader(
+        self,
+        batch_size: int,
+        *,
+        num_workers: int = 0,
+        device: str | torch.device = "cpu",
+        rank: int = 0,
+        world_size: int = 1,
+        micro_batch: int = 8,
+        multiprocessing_context: str | None = None,
+    ) -> StereoLoader:
+        """Finished batches on `device`, made ahead by `num_workers` processes.
+
+        Args:
+            batch_size: pairs per batch and rank.
+            num_workers: processes on the CPU; 0 makes the pairs in this one.
+            device: where the batches are finished and given out.
+            rank, world_size: which share of every global batch this process is given.
+            micro_batch: pairs that are inpainted at once; changes memory and speed, never a picture.
+            multiprocessing_context: "fork", "forkserver" or "spawn"; None is Python's own choice.
+        """
+        if micro_batch < 1:
+            raise ValueError(f"micro_batch is 1 or more; got {micro_batch}")
+        return StereoLoader(
+            worker=self._worker,
+            finisher=self._finisher(torch.device(device), micro_batch),
+            place=lambda: self._place(0, 0),
+            revision=lambda: self._revision,
+            epoch_size=self.epoch_size,
+            budget=self._budget,
+            problems=self._problems,
+            batch_size=batch_size,
+            num_workers=num_workers,
+            rank=rank,
+            world_size=world_size,
+            multiprocessing_context=multiprocessing_context,
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """The place of the loop over the stream itself; a loader has its own."""
+        return self._place(self._epoch, self._samples).to_state()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Goes to the place that `state_dict` (of the stream or of a loader) named.
+
+        Raises:
+            ValueError: for a state of another stream; it names the field that differs.
+        """
+        place = Position.from_state(state, self._place(0, 0))
+        self._epoch, self._samples = place.epoch, place.samples
+
+    def stats(self) -> dict[str, Any]:
+        """What the loop over the stream itself has seen, as `StereoLoader.stats` says it."""
+        return {
+            "pairs": self._faults.made,
+            "rejected": dict(self._faults.by_reason),
+            "examples": list(self._faults.examples),
+            "shard_problems": dict(self._problems),
+            "seconds": dict(self._meter.seconds),
+        }
+
+    def _make(self, epoch: int, index: int) -> StereoBatch:
+        prepared = self._worker.prepare(epoch, index)
+        self._meter.seconds.update(prepared.seconds)
+        self._faults.add(1, prepared.rejected)
+        return self._finish(prepared)
+
+    def _finish(self, prepared: Prepared) -> StereoBatch:
+        if self._cpu_finisher is None:
+            self._cpu_finisher = self._finisher(torch.device("cpu"), micro_batch=1)
+        with single_thread():
+            return self._cpu_finisher(Prepared.stack([prepared]), self._meter)[0]
+
+    def _finisher(self, device: torch.device, micro_batch: int) -> Finisher:
+        return Finisher(load_inpainter(self._inpaint, device), self._augmentation, micro_batch, device)
+
+    def _place(self, epoch: int, samples: int) -> Position:
+        recipe = self._recipe
+        configuration = {
+            "size": recipe.size,
+            "depth": _name_of(recipe.depth),
+            "inpaint": _name_of(self._inpaint),
+            "disparity": [type(recipe.disparity).__name__, asdict(recipe.disparity)],
+            "view": asdict(recipe.view),
+            "synthesis": asdict(recipe.synthesis),
+            "augmentation": asdict(self._augmentation),
+        }
+        digest = hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest()
+        return Position(seed=recipe.seed, epoch=epoch, samples=samples, manifest=self._schedule.digest, configuration=digest)
+
+
+def _name_of(step: Any) -> str:
+    return step if isinstance(step, str) else f"{type(step).__module__}.{getattr(step, '__qualname__', type(step).__qualname__)}"

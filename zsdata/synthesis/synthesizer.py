@@ -1,0 +1,94 @@
+"""The synthesizer: the method section of the paper, step by step. The only file that knows their order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from zsdata.synthesis.confidence import flip_confidence, flip_consistency, normalize_inverse_depth
+from zsdata.synthesis.depth import DepthEstimator
+from zsdata.synthesis.disparity import SMALLEST_DISPARITY_PX, dilate_disparity, sharpen_disparity
+from zsdata.synthesis.view import View, view_map
+from zsdata.synthesis.warp import Warped, forward_warp
+
+
+class DepthMaps(NamedTuple):
+    """What is known of a photo's depth, whatever is drawn from it.
+
+    Attributes:
+        inverse_depth: float32 [B, 1, h, w] in [0, 1].
+        confidence: float32 [B, 1, h, w] in [0, 1].
+        consistency: float64 [B], the mean flip consistency before normalisation.
+    """
+
+    inverse_depth: Tensor
+    confidence: Tensor
+    consistency: Tensor
+
+
+class Synthesized(NamedTuple):
+    """A pair before inpainting; all of the crop's size. The fields are those of `StereoBatch` and `Warped`."""
+
+    left: Tensor
+    disparity: Tensor
+    confidence: Tensor
+    warped: Warped
+
+
+@dataclass(frozen=True, kw_only=True)
+class SynthesisConfig:
+    """How depth becomes disparity."""
+
+    dilate_px: int = 1  # the rim of an object moves with it (paper, supplement, "Forward Warping")
+    flip_confidence: bool = True  # TCG; without it every label has confidence 1 and the mirrored photo needs no depth
+
+    def __post_init__(self) -> None:
+        if self.dilate_px < 0:
+            raise ValueError(f"dilate_px is 0 or more; got {self.dilate_px}")
+
+
+def estimate_depth(depth: DepthEstimator, photos: Tensor, config: SynthesisConfig) -> DepthMaps:
+    """Depth of the photos and of the mirrored photos, and how far they agree.
+
+    Args:
+        depth: an estimator as `load_depth` returns it.
+        photos: float32 [B, 3, h, w], RGB 0..255.
+    """
+    inverse_depth = normalize_inverse_depth(_checked(depth(photos), photos))
+    if not config.flip_confidence:
+        return DepthMaps(inverse_depth, torch.ones_like(inverse_depth), torch.ones(len(photos), dtype=torch.float64))
+    mirrored = normalize_inverse_depth(_checked(depth(photos.flip(-1)), photos)).flip(-1)
+    confidence = flip_confidence(inverse_depth, mirrored)
+    return DepthMaps(inverse_depth, confidence, flip_consistency(inverse_depth, mirrored))
+
+
+def synthesize(photo_view: Tensor, depth: DepthMaps, view: View, photo_size: tuple[int, int], scale: float, config: SynthesisConfig) -> Synthesized:
+    """The right view of one photo's view, with holes, and both masks.
+
+    Args:
+        photo_view: float32 [1, 3, height, width], the view's part of the photo, margin included.
+        depth: of the whole photo.
+        view: where the crop lies in the photo.
+        photo_size: (height, width) of the whole photo.
+        scale: disparity of the photo's nearest point as a share of its width.
+    """
+    largest_px = scale * photo_size[1] * view.scale_x
+    disparity = view_map(depth.inverse_depth, view, photo_size) * largest_px
+    disparity = sharpen_disparity(dilate_disparity(disparity, config.dilate_px)).clamp(min=SMALLEST_DISPARITY_PX)
+    confidence = view_map(depth.confidence, view, photo_size)
+    warped = forward_warp(photo_view, disparity)
+
+    width = view.width - view.margin
+    return Synthesized(
+        photo_view[..., :width], disparity[..., :width], confidence[..., :width], Warped(*(field[..., :width] for field in warped))
+    )
+
+
+def _checked(inverse_depth: Tensor, photos: Tensor) -> Tensor:
+    expected = (photos.shape[0], 1, *photos.shape[2:])
+    if tuple(inverse_depth.shape) != expected:
+        raise ValueError(f"the depth estimator must return [B, 1, H, W] = {list(expected)}; got {list(inverse_depth.shape)}")
+    return inverse_depth

@@ -1,0 +1,222 @@
+"""The worker: one index on the CPU, from the photo's bytes to all that the training device needs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from zsdata.faults import BadPhoto, BadShard
+from zsdata.meter import Meter
+from zsdata.plan import Choice
+from zsdata.seeding import rng
+from zsdata.source.photo import decode_rgb
+from zsdata.sources import Schedule, SourceSet
+from zsdata.synthesis.depth import DepthEstimator, load_depth
+from zsdata.synthesis.disparity import AdaptiveDisparity, UniformDisparity
+from zsdata.synthesis.synthesizer import SynthesisConfig, estimate_depth, synthesize
+from zsdata.synthesis.view import ViewConfig, draw_view, view_photo
+
+SHORTEST_SIDE_PX = 32  # a photo with a shorter side shows no scene
+MOST_SPARES = 100  # tried for one sample before the source is called unusable
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """All that a sample depends on but its epoch and index; travels to the workers."""
+
+    seed: int
+    size: tuple[int, int]
+    schedule: Schedule
+    depth: str | DepthEstimator
+    disparity: AdaptiveDisparity | UniformDisparity
+    view: ViewConfig
+    synthesis: SynthesisConfig
+    inpainter_needs: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A pair before inpainting, as it crosses the process border: images uint8, masks bool.
+
+    One sample has no batch axis and one `meta`; `stack` makes a batch of them. `right` is 0 in its holes; `right_disparity` and
+    `background` are there where the inpainter needs them. `rejected` lists (source, shard, key, reason) of the photos that could not be used.
+    """
+
+    left: Tensor
+    right: Tensor
+    disparity: Tensor
+    confidence: Tensor
+    nonocclusion: Tensor
+    inpaint: Tensor
+    context: dict[str, Tensor]
+    meta: Any
+    rejected: list[tuple[str, str, str, str]] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def stack(samples: list[Prepared]) -> Prepared:
+        """Single samples to one batch, in order."""
+        tensors = {
+            name: torch.stack([getattr(sample, name) for sample in samples])
+            for name in ("left", "right", "disparity", "confidence", "nonocclusion", "inpaint")
+        }
+        seconds = Meter()
+        for sample in samples:
+            seconds.seconds.update(sample.seconds)
+        return Prepared(
+            **tensors,
+            context={name: torch.stack([sample.context[name] for sample in samples]) for name in samples[0].context},
+            meta=[sample.meta for sample in samples],
+            rejected=[reject for sample in samples for reject in sample.rejected],
+            seconds=dict(seconds.seconds),
+        )
+
+    def pin_memory(self) -> Prepared:
+        """The same in page-locked memory (called by torch's DataLoader)."""
+        values = {name: value.pin_memory() if isinstance(value, Tensor) else value for name, value in vars(self).items()}
+        return Prepared(**{**values, "context": {name: value.pin_memory() for name, value in self.context.items()}})
+
+
+class Worker:
+    """Makes pairs, one index at a time, on the CPU. The depth estimator is loaded at the first call, in the process that uses it."""
+
+    def __init__(self, recipe: Recipe) -> None:
+        self._recipe = recipe
+        self._depth: DepthEstimator | None = None
+
+    def prepare(self, epoch: int, index: int) -> Prepared:
+        """Sample `index` of `epoch` up to the holes; a photo that cannot be used is replaced by the sample's next spare.
+
+        Raises:
+            RuntimeError: when no spare can be used either, with the reasons; or when a step fails, with the sample named.
+        """
+        sources = self._recipe.schedule.at(epoch)
+        rejected: list[tuple[str, str, str, str]] = []
+        choice: Choice | None = sources.plan.choose(epoch, index)
+        with single_thread():
+            while choice is not None and len(rejected) <= MOST_SPARES:
+                member = sources.manifests[choice.source].member(choice.member)
+                name = sources.names[choice.source]
+                try:
+                    return self._pair(sources, choice, epoch, index, rejected)
+                except (BadPhoto, BadShard) as fault:
+                    rejected.append((name, member.shard_url, member.key, fault.reason))
+                except Exception as error:
+                    raise RuntimeError(
+                        f'sample {index} of epoch {epoch} (source "{name}", "{member.key}" in {member.shard_url}) failed: {error}'
+                    ) from error
+                choice = sources.plan.spare(epoch, index, len(rejected) - 1)
+        last = "; ".join(f"{key} in {shard}: {reason}" for _, shard, key, reason in rejected[-3:])
+        raise RuntimeError(
+            f'no usable photo for sample {index} of epoch {epoch}: {len(rejected)} of source "{rejected[0][0]}" were refused, '
+            f"the last ones: {last}. `zsdata verify` lists what is wrong with its shards."
+        )
+
+    def _pair(
+        self, sources: SourceSet, choice: Choice, epoch: int, index: int, rejected: list[tuple[str, str, str, str]]
+    ) -> Prepared:
+        recipe, meter = self._recipe, Meter()
+        manifest = sources.manifests[choice.source]
+        with meter.stage("read"):
+            data = manifest.read(choice.member)
+        with meter.stage("decode"):
+            photo = decode_rgb(data)
+        photo_size = photo.shape[:2]
+        if min(photo_size) < SHORTEST_SIDE_PX:
+            raise BadPhoto(f"too small: a side shorter than {SHORTEST_SIDE_PX} px: {photo_size[1]}x{photo_size[0]}")
+        with meter.stage("view"):
+            scale = recipe.disparity.draw_scale(rng(recipe.seed, epoch, index, "disparity"), photo_size[1])
+            view = draw_view(photo_size, recipe.size, rng(recipe.seed, epoch, index, "view"), recipe.view, scale)
+            left = _image(view_photo(photo, view))
+        with meter.stage("depth"):
+            if self._depth is None:
+                self._depth = load_depth(recipe.depth)
+            with torch.inference_mode():
+                depth = estimate_depth(self._depth, _image(photo), recipe.synthesis)
+        with meter.stage("warp"):
+            made = synthesize(left, depth, view, photo_size, scale, recipe.synthesis)
+
+        warped, context = made.warped, {}
+        if "right_disparity" in recipe.inpainter_needs:
+            context["right_disparity"] = warped.right_disparity[0].contiguous()
+        if "background" in recipe.inpainter_needs:
+            with meter.stage("background"):
+                context["background"] = torch.from_numpy(self._background(sources, choice, epoch, index, photo)).permute(2, 0, 1).contiguous()
+        member = manifest.member(choice.member)
+        meta = {
+            "seed": recipe.seed,
+            "epoch": epoch,
+            "index": index,
+            "source": sources.names[choice.source],
+            "shard": member.shard_url,
+            "key": member.key,
+            "photo_size": list(photo_size),
+            "window": list(view.window),
+            "mirror": view.mirror,
+            "disparity_scale": scale,
+            "largest_disparity_px": float(made.disparity.max()),
+            "flip_consistency": round(float(depth.consistency[0]), 6),
+            "hole_share": float(warped.inpaint_mask.count_nonzero()) / warped.inpaint_mask.numel(),
+        }
+        return Prepared(
+            left=_to_uint8(made.left),
+            right=_to_uint8(warped.right),
+            disparity=made.disparity[0].contiguous(),
+            confidence=made.confidence[0].contiguous(),
+            nonocclusion=warped.nonocclusion_mask[0].contiguous(),
+            inpaint=warped.inpaint_mask[0].contiguous(),
+            context=context,
+            meta=meta,
+            rejected=rejected,
+            seconds=dict(meter.seconds),
+        )
+
+    def _background(self, sources: SourceSet, choice: Choice, epoch: int, index: int, photo: np.ndarray) -> np.ndarray:
+        """Another photo of the source at the crop's size; the photo itself where the source has no other that can be read."""
+        generator = rng(self._recipe.seed, epoch, index, "background")
+        manifest = sources.manifests[choice.source]
+        for _ in range(3):
+            other = int(generator.integers(len(manifest)))
+            if other == choice.member:
+                continue
+            try:
+                photo = decode_rgb(manifest.read(other))
+                break
+            except (BadPhoto, BadShard):  # counted when its own turn comes
+                continue
+        height, width = self._recipe.size
+        return cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _image(photo: np.ndarray) -> Tensor:
+    """uint8 [H, W, 3] to float32 [1, 3, H, W]."""
+    return torch.from_numpy(photo).permute(2, 0, 1).unsqueeze(0).to(torch.float32, memory_format=torch.contiguous_format)
+
+
+def _to_uint8(image: Tensor) -> Tensor:
+    """float [1, 3, H, W] 0..255 to uint8 [3, H, W], rounded."""
+    return (image[0] + 0.5).to(torch.uint8).contiguous()
+
+
+@contextmanager
+def single_thread() -> Iterator[None]:
+    """One thread for torch and OpenCV, whatever the environment says: workers share the machine, and a sample must not depend on it."""
+    threads, cv_threads = torch.get_num_threads(), cv2.getNumThreads()
+    try:
+        if threads != 1:
+            torch.set_num_threads(1)
+        if cv_threads != 1:
+            cv2.setNumThreads(1)
+        yield
+    finally:
+        if threads != 1:
+            torch.set_num_threads(threads)
+        if cv_threads != 1:
+            cv2.setNumThreads(cv_threads)
