@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -235,15 +236,17 @@ class _Pipeline:
                 "multiprocessing_context": context,
                 "worker_init_fn": _use_one_thread,
             }
-        loader = DataLoader(
-            _Samples(worker),
-            batch_sampler=requests,  # type: ignore[arg-type]  # any iterable of lists of what the dataset is asked for
-            num_workers=num_workers,
-            collate_fn=Prepared.stack,
-            pin_memory=device.type == "cuda",
-            **several,
-        )
-        self._batches = iter(loader)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "This DataLoader will create")  # how many processes to start is the user's decision
+            loader = DataLoader(
+                _Samples(worker),
+                batch_sampler=requests,  # type: ignore[arg-type]  # any iterable of lists of what the dataset is asked for
+                num_workers=num_workers,
+                collate_fn=Prepared.stack,
+                pin_memory=device.type == "cuda",
+                **several,
+            )
+            self._batches = iter(loader)
 
     def __next__(self) -> Prepared:
         return next(self._batches)

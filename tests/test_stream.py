@@ -1,0 +1,324 @@
+import hashlib
+import json
+import logging
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from tests.scenes import grey_fill, jpeg, layered_depth, photo, photo_tar, write_tar
+from zsdata import AdaptiveDisparity, AugmentConfig, ImageSource, StereoBatch, UniformDisparity, ZeroStereoStream
+
+SIZE = (64, 96)
+
+
+def open_stream(sources, **options):
+    return ZeroStereoStream(sources, **{"size": SIZE, "depth": layered_depth, "inpaint": grey_fill, **options})
+
+
+def fingerprint(pair: StereoBatch) -> str:
+    """A hash of every byte of one pair."""
+    tensors = (pair.left, pair.right, pair.disparity, pair.confidence, *pair.masks, pair.left_clean, pair.right_clean)
+    digest = hashlib.sha256(json.dumps(pair.meta, sort_keys=True).encode())
+    for tensor in tensors:
+        digest.update(str((tensor.dtype, tuple(tensor.shape))).encode() + tensor.contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def by_index(pairs):
+    return {(pair.meta["epoch"], pair.meta["index"]): fingerprint(pair) for pair in pairs}
+
+
+@pytest.fixture(scope="module")
+def tar(tmp_path_factory):
+    return photo_tar(tmp_path_factory.mktemp("tar") / "photos.tar", 12)
+
+
+@pytest.fixture(scope="module")
+def plain(tar):
+    return by_index(open_stream(tar))
+
+
+def test_a_pair_unpacks_into_the_documented_fields(tar):
+    left, right, disparity, confidence, masks = pair = next(iter(open_stream(tar)))
+    for image in (left, right, pair.left_clean, pair.right_clean):
+        assert image.shape == (3, *SIZE) and image.dtype == torch.float32
+        assert 0 <= image.min() and image.max() <= 255 and image.max() > 1
+    for label in (disparity, confidence):
+        assert label.shape == (1, *SIZE) and label.dtype == torch.float32
+    assert disparity.min() > 0 and 0 <= confidence.min() and confidence.max() <= 1
+    for mask in masks:
+        assert mask.shape == (1, *SIZE) and mask.dtype == torch.bool
+    assert masks.nonocclusion.any() and masks.inpaint.any() and masks.valid.all()
+    assert json.loads(json.dumps(pair.meta)) == pair.meta
+
+
+def test_an_epoch_is_one_exact_pass_and_the_next_one_another_order(tar):
+    stream = open_stream(tar)
+    first, second = ([pair.meta["key"] for pair in stream] for _ in range(2))
+    assert len(stream) == 12
+    assert sorted(first) == sorted(second) == [f"{i:06d}" for i in range(12)]
+    assert first != second
+
+
+def test_a_loop_that_was_broken_off_goes_on_where_it_stopped(tar, plain):
+    stream, pairs = open_stream(tar), []
+    for _ in range(3):
+        for pair in stream:
+            pairs.append(pair)
+            if len(pairs) % 4 == 0:
+                break
+    assert by_index(pairs) == plain and stream.state_dict()["samples"] == 12
+
+
+def test_a_state_brings_the_loop_over_the_stream_back(tar, plain):
+    first = open_stream(tar)
+    pairs = list(islice(first, 5))
+    second = open_stream(tar)
+    second.load_state_dict(json.loads(json.dumps(first.state_dict())))
+    pairs += list(second)
+    assert by_index(pairs) == plain and len(pairs) == 12
+
+
+def test_replay_gives_the_very_same_pair(tar, plain):
+    stream = open_stream(tar)
+    assert all(fingerprint(stream.replay(epoch=epoch, index=index)) == value for (epoch, index), value in plain.items())
+    with pytest.raises(IndexError, match="sample 12 of an epoch of 12"):
+        stream.replay(epoch=0, index=12)
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")  # torch's hint on machines with fewer cores
+@pytest.mark.parametrize("workers", [0, 1, 2, 3])
+def test_a_torch_dataloader_gives_the_same_pairs(tar, plain, workers):
+    loader = DataLoader(open_stream(tar), batch_size=2, num_workers=workers)
+    batches = list(loader)
+    assert all(isinstance(batch, StereoBatch) for batch in batches)
+    assert by_index(batch[i] for batch in batches for i in range(len(batch))) == plain
+
+
+@pytest.mark.parametrize("workers", [0, 1, 2, 3])
+@pytest.mark.parametrize("batch_size", [1, 3])
+def test_the_loader_gives_the_same_pairs(tar, plain, workers, batch_size):
+    with open_stream(tar).loader(batch_size, num_workers=workers) as loader:
+        batches = list(loader)
+        assert len(batches) == len(loader) == 12 // batch_size
+    assert by_index(batch[i] for batch in batches for i in range(len(batch))) == plain
+
+
+def test_set_epoch_reaches_dataloader_workers(tar):
+    stream = open_stream(tar)
+    loader = DataLoader(stream, batch_size=None, num_workers=2)
+    keys = []
+    for epoch in range(2):
+        stream.set_epoch(epoch)
+        keys.append([pair.meta["index"] for pair in loader if pair.meta["epoch"] == epoch])
+    assert [sorted(indices) for indices in keys] == [list(range(12))] * 2
+
+
+def test_persistent_dataloader_workers_move_on_by_themselves(tar):
+    loader = DataLoader(open_stream(tar), batch_size=None, num_workers=2, persistent_workers=True)
+    epochs = [{pair.meta["epoch"] for pair in loader} for _ in range(3)]
+    assert epochs == [{0}, {1}, {2}]
+
+
+def test_another_seed_gives_other_pairs(tar, plain):
+    other = by_index(open_stream(tar, seed=1))
+    assert not set(other.values()) & set(plain.values())
+
+
+def test_the_folder_of_the_shards_does_not_matter_to_the_place(tar, tmp_path):
+    moved = tmp_path / "photos.tar"
+    moved.write_bytes(Path(tar).read_bytes())
+    open_stream(str(moved)).load_state_dict(open_stream(tar).state_dict())
+
+
+def test_weighted_sources_are_mixed_by_their_weights(tmp_path):
+    first, second = photo_tar(tmp_path / "a.tar", 5), photo_tar(tmp_path / "b.tar", 5, first_seed=50)
+    stream = open_stream({"a": ImageSource(first, weight=0.75), "b": ImageSource(second, weight=0.25)}, epoch_size=16)
+    sources = [pair.meta["source"] for pair in stream]
+    assert (sources.count("a"), sources.count("b")) == (12, 4)
+
+
+def test_a_schedule_swaps_sources_between_epochs(tmp_path):
+    first, second = photo_tar(tmp_path / "a.tar", 3), photo_tar(tmp_path / "b.tar", 4, first_seed=50)
+    stream = open_stream({0: first, 2: {"late": second}})
+    sources = [[pair.meta["source"] for pair in stream] for _ in range(3)]
+    assert sources == [["photos"] * 3, ["photos"] * 3, ["late"] * 4]
+
+
+def test_set_sources_equals_a_schedule(tmp_path):
+    first, second = photo_tar(tmp_path / "a.tar", 3), photo_tar(tmp_path / "b.tar", 4, first_seed=50)
+    planned, swapped = open_stream({0: first, 1: second}), open_stream(first)
+    swapped.set_sources(second, epoch=1)
+    assert by_index([*planned, *planned]) == by_index([*swapped, *swapped])
+    swapped.load_state_dict(planned.state_dict())
+
+
+def test_a_bad_photo_is_counted_and_replaced(tmp_path):
+    good = {f"{i}.jpg": jpeg(photo(i)) for i in range(4)}
+    tar = write_tar(tmp_path / "mixed.tar", {**good, "cut.jpg": jpeg(photo(9))[:2000], "page.jpg": b"<html>not found</html>" * 20})
+    stream = open_stream(tar)
+    pairs = list(stream)
+    assert len(pairs) == 6 and {pair.meta["key"] for pair in pairs} <= {"0", "1", "2", "3"}
+    stats = stream.stats()
+    assert sum(stats["rejected"].values()) >= 2 and {example[2] for example in stats["examples"]} == {"cut", "page"}
+    assert by_index(pairs) == by_index(open_stream(tar))
+
+
+def test_a_source_without_one_usable_photo_is_an_error_that_says_why(tmp_path):
+    tar = write_tar(tmp_path / "bad.tar", {"a.jpg": b"no", "b.jpg": b"never"})
+    with pytest.raises(RuntimeError, match=r"no usable photo for sample 0 of epoch 0: 2 of source .photos. were refused"):
+        next(iter(open_stream(tar)))
+
+
+def odd_photos():
+    from io import BytesIO
+
+    from PIL import Image
+
+    def saved(image, kind, **options):
+        buffer = BytesIO()
+        image.save(buffer, kind, **options)
+        return buffer.getvalue()
+
+    rgb = Image.fromarray(photo(3))
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    sixteen = (np.asarray(rgb.convert("L")).astype(np.uint16) * 257)
+    palette = rgb.convert("RGBA")
+    palette.putalpha(Image.fromarray((np.indices((120, 160))[1] % 256).astype(np.uint8)))
+    return {
+        "constant.png": saved(Image.new("RGB", (160, 120), (90, 90, 90)), "PNG"),
+        "thin.png": saved(Image.new("RGB", (1, 120)), "PNG"),
+        "tiny.png": saved(rgb.resize((8, 6)), "PNG"),
+        "small.png": saved(rgb.resize((40, 33)), "PNG"),
+        "grey.jpg": saved(rgb.convert("L"), "JPEG"),
+        "cmyk.jpg": saved(rgb.convert("CMYK"), "JPEG"),
+        "turned.jpg": saved(rgb, "JPEG", exif=exif),
+        "deep.png": saved(Image.fromarray(sixteen), "PNG"),
+        "palette.png": saved(palette.quantize(16), "PNG"),
+        "wide.jpg": saved(rgb.resize((900, 40)), "JPEG"),
+    }
+
+
+@pytest.mark.parametrize("depth", [layered_depth, "builtin"])
+@pytest.mark.filterwarnings("ignore::zsdata.synthesis.depth.builtin.BuiltinDepthWarning")
+def test_odd_photos_give_a_right_pair_or_are_counted(tmp_path, depth):
+    tar = write_tar(tmp_path / "odd.tar", odd_photos())
+    stream = open_stream(tar, depth=depth, inpaint="builtin")
+    seen = set()
+    for pair in stream:
+        seen.add(pair.meta["key"])
+        for tensor in (pair.left, pair.right, pair.disparity, pair.confidence, pair.right_clean):
+            assert torch.isfinite(tensor).all()
+        assert pair.disparity.min() > 0 and pair.confidence.min() >= 0 and pair.confidence.max() <= 1
+    assert {"constant", "small", "grey", "cmyk", "turned", "deep", "palette", "wide"} <= seen
+    assert {example[2] for example in stream.stats()["examples"]} == {"thin", "tiny"}
+    assert sum(stream.stats()["rejected"].values()) >= 2
+
+
+def test_the_largest_disparity_is_the_drawn_share_of_the_photos_width(tar):
+    for pair in open_stream(tar, augmentation=AugmentConfig.none()):
+        scale = (SIZE[1]) / min(pair.meta["window"][3], 160)  # a bound: the window holds the margin too
+        assert pair.disparity.max() <= 0.2 * 160 * max(scale, 2.0)
+        assert 0 < pair.meta["disparity_scale"] < 0.2
+
+
+def test_the_uniform_baseline_draws_pixels(tar):
+    pairs = list(open_stream(tar, disparity=UniformDisparity(min_px=10, max_px=12)))
+    assert all(10 <= pair.meta["disparity_scale"] * 160 <= 12 for pair in pairs)
+
+
+def test_the_label_reprojects_the_right_image_onto_the_left(tar):
+    from zsdata import backward_warp
+
+    for pair in open_stream(tar):
+        back = backward_warp(pair.right_clean[None], pair.disparity[None])[0]
+        known = backward_warp((~pair.masks.inpaint)[None].float(), pair.disparity[None])[0] > 0.999
+        both = (known & pair.masks.nonocclusion).expand_as(back)
+        assert (back - pair.left_clean)[both].abs().mean() < 2
+
+
+def test_without_augmentation_the_pair_is_the_clean_one(tar):
+    pair = next(iter(open_stream(tar, augmentation=AugmentConfig.none())))
+    assert torch.equal(pair.left, pair.left_clean) and torch.equal(pair.right, pair.right_clean)
+
+
+def test_holes_alone_are_invented(tar):
+    pair = next(iter(open_stream(tar)))
+    hole = pair.masks.inpaint.expand_as(pair.right_clean)
+    assert pair.right_clean[hole].unique().numel() == 1
+    assert pair.right_clean[~hole].unique().numel() > 50
+
+
+def test_an_inpainter_that_fails_is_told_so(tar):
+    with pytest.raises(ValueError, match="NaN or infinity"):
+        next(iter(open_stream(tar, inpaint=lambda right, mask, generators: right * float("nan"))))
+    with pytest.raises(ValueError, match="must return"):
+        next(iter(open_stream(tar, inpaint=lambda right, mask, generators: right[..., 1:])))
+
+
+def test_a_depth_estimator_that_fails_names_the_sample(tar):
+    def broken(images):
+        raise RuntimeError("out of luck")
+
+    with pytest.raises(RuntimeError, match=r'sample 0 of epoch 0 \(source "photos", "0000\d\d" in .*photos.tar\) failed: out of luck'):
+        next(iter(open_stream(tar, depth=broken)))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": 5}, "seed"),
+        ({"size": (64, 64)}, "configuration"),
+        ({"disparity": AdaptiveDisparity(center=0.2)}, "configuration"),
+        ({"epoch_size": 5}, "manifest"),
+    ],
+)
+def test_a_state_of_another_stream_is_refused_by_field(tar, change, message):
+    state = open_stream(tar).state_dict()
+    with pytest.raises(ValueError, match=f"the state's {message} is"):
+        open_stream(tar, **change).load_state_dict(state)
+
+
+@pytest.mark.parametrize("state", [None, {}, {"version": 1}, {"epoch": 1, "extra": 2}])
+def test_what_is_no_state_is_refused(tar, state):
+    with pytest.raises(ValueError, match="state"):
+        open_stream(tar).load_state_dict(state)
+
+
+@pytest.mark.parametrize("value", [-1, 1.5, "3", True, None])
+def test_a_state_with_a_bad_place_is_refused(tar, value):
+    stream = open_stream(tar)
+    with pytest.raises(ValueError, match="samples"):
+        stream.load_state_dict({**stream.state_dict(), "samples": value})
+
+
+@pytest.mark.parametrize(
+    ("sources", "options", "error"),
+    [
+        ("nowhere.tar", {}, FileNotFoundError),
+        ({}, {}, ValueError),
+        ({5: "a.tar"}, {}, ValueError),
+        ({"a": "a.tar", 0: "b.tar"}, {}, TypeError),
+        (None, {"seed": -1}, ValueError),
+        (None, {"seed": 1.5}, ValueError),
+        (None, {"size": (384,)}, ValueError),
+        (None, {"size": (8, 8)}, ValueError),
+        (None, {"epoch_size": 0}, ValueError),
+    ],
+)
+def test_arguments_that_cannot_work_are_refused_at_once(tar, sources, options, error):
+    with pytest.raises(error):
+        open_stream(tar if sources is None else sources, **options)
+
+
+def test_problems_of_the_shards_are_said_and_counted(tmp_path, caplog):
+    tar = write_tar(tmp_path / "a.tar", {"a.jpg": jpeg(photo(1)), "b.tif": b"II*\0"})
+    with caplog.at_level(logging.WARNING, logger="zsdata"):
+        stream = open_stream(tar)
+    assert sum(stream.stats()["shard_problems"].values()) == 1
+    assert "1 faults in the shards" in caplog.text
