@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from zsdata.metrics import bad_pixel_rate, d1, end_point_error
+
+
+def plain_metrics(prediction, disparity, valid, threshold):
+    errors = [(abs(float(p) - float(d)), float(d)) for p, d, v in zip(prediction, disparity, valid, strict=True) if v]
+    n = len(errors)
+    return (
+        sum(e for e, _ in errors) / n,
+        sum(e > threshold for e, _ in errors) / n,
+        sum(e > 3 and e / d > 0.05 for e, d in errors) / n,
+    )
+
+
+@pytest.mark.parametrize("threshold", [1.0, 2.0, 3.0])
+def test_the_metrics_are_those_of_plain_loops(threshold):
+    rng = np.random.default_rng(0)
+    disparity = rng.uniform(1, 150, (2, 1, 9, 13)).astype(np.float32)
+    prediction = disparity + rng.normal(0, 4, disparity.shape).astype(np.float32)
+    valid = rng.random(disparity.shape) < 0.7
+    expected = plain_metrics(prediction.ravel(), disparity.ravel(), valid.ravel(), threshold)
+    maps = [torch.from_numpy(array) for array in (prediction, disparity, valid)]
+    assert (end_point_error(*maps), bad_pixel_rate(*maps, threshold), d1(*maps)) == pytest.approx(expected, rel=1e-12)
+
+
+def test_an_error_at_the_threshold_is_not_bad():
+    disparity = torch.tensor([10.0, 10.0, 100.0, 100.0])
+    prediction = torch.tensor([13.0, 13.5, 104.0, 106.0])
+    valid = torch.ones(4, dtype=torch.bool)
+    assert bad_pixel_rate(prediction, disparity, valid, 3) == 0.75
+    assert d1(prediction, disparity, valid) == 0.5  # 4 px of 100 are within 5 %
+
+
+def test_what_is_not_valid_is_not_looked_at():
+    disparity = torch.tensor([5.0, math.inf, math.nan, 0.0])
+    prediction = torch.tensor([7.0, 1.0, math.nan, math.inf])
+    valid = torch.tensor([True, False, False, False])
+    assert end_point_error(prediction, disparity, valid) == 2.0
+    assert bad_pixel_rate(prediction, disparity, valid, 1) == 1.0
+
+
+def test_a_picture_without_a_valid_pixel_has_no_error():
+    disparity = torch.ones(3, 4)
+    nothing = torch.zeros(3, 4, dtype=torch.bool)
+    assert math.isnan(end_point_error(disparity, disparity, nothing))
+    assert math.isnan(bad_pixel_rate(disparity, disparity, nothing, 1))
+    assert math.isnan(d1(disparity, disparity, nothing))
+
+
+def test_a_large_picture_loses_no_precision():
+    disparity = torch.full((2000, 3000), 100.0)
+    prediction = disparity + 0.125
+    assert end_point_error(prediction, disparity, torch.ones(2000, 3000, dtype=torch.bool)) == 0.125
+
+
+def test_what_does_not_fit_is_named():
+    disparity = torch.ones(2, 3)
+    valid = torch.ones(2, 3, dtype=torch.bool)
+    with pytest.raises(ValueError, match=r"\[2, 2\], \[2, 3\]"):
+        end_point_error(disparity[:, 1:], disparity, valid)
+    with pytest.raises(TypeError, match="float32"):
+        d1(disparity, disparity, valid.float())
+    with pytest.raises(ValueError, match="prediction is not finite at 6 of 6"):
+        d1(disparity * math.nan, disparity, valid)
+    with pytest.raises(ValueError, match="disparity is not finite at 6 of 6"):
+        bad_pixel_rate(disparity, disparity * math.inf, valid, 1)
+    with pytest.raises(ValueError, match="threshold_px"):
+        bad_pixel_rate(disparity, disparity, valid, 0)
