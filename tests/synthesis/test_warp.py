@@ -39,8 +39,7 @@ def test_a_subpixel_shift_interpolates_between_the_two_pixels():
     row = left.flatten().tolist()
     for u in range(1, 27):
         expected = catmull_rom(row[u + 2 : u + 6], 0.25)
-        low, high = sorted(row[u + 3 : u + 5])
-        assert warp.right[0, 0, 0, u].item() == pytest.approx(min(max(expected, low), high), abs=1e-3)
+        assert warp.right[0, 0, 0, u].item() == pytest.approx(min(max(expected, min(row)), max(row)), abs=1e-3)
 
 
 @pytest.mark.parametrize("slope", [-0.9, -0.5, -0.1, 0.1, 0.5, 0.9])

@@ -44,8 +44,7 @@ def forward_warp(left: Tensor, disparity: Tensor) -> Warped:
     no sum depends on the batch: a sample's result is the same bit for bit in any batch. Differentiable in `left`; not in `disparity`.
 
     Args:
-        left: float [B, C, H, W]; RGB 0..255 in the stream, any C and range here (the result is kept within the range of the two
-            nearest source pixels of each surface point).
+        left: float [B, C, H, W]; RGB 0..255 in the stream, any C and range here (the result is kept within the range of each image).
         disparity: float [B, 1, H, W], pixels, left frame, >= 0. Zero leaves the photo as it is. A non-finite value covers nothing.
 
     Raises:
@@ -141,8 +140,9 @@ def _resample_rows(left: Tensor, first: Tensor, second: Tensor, share: Tensor, j
         step = there - here
         back, on = back - ends_before * step, on + ends_after * step  # past the end of a surface its colour goes on straight
         value = back * weight_before + here * weight_first + there * weight_second + on * weight_after
-        planes.append(torch.minimum(torch.maximum(value, torch.minimum(here, there)), torch.maximum(here, there)))
-    return torch.stack(planes, 1)
+        planes.append(value)
+    low, high = left.amin((1, 2, 3), keepdim=True), left.amax((1, 2, 3), keepdim=True)
+    return torch.stack(planes, 1).clamp(low, high)
 
 
 def _wins_where_it_lands(rows: Tensor, right_disparity: Tensor, hole: Tensor) -> Tensor:
