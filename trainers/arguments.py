@@ -1,0 +1,123 @@
+"""The command line that all matcher trainers share: the stream, the training, the evaluation."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from trainers.loop import TrainConfig
+from trainers.pairs_on_disk import StereoPair, find_pairs, motorcycle, read_pair
+from zsdata import AdaptiveDisparity, AugmentConfig, ImageSource, SynthesisConfig, UniformDisparity, ZeroStereoStream
+
+
+def add_training_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds every option but the matcher's own."""
+    defaults = TrainConfig()
+    stream = parser.add_argument_group("the stream")
+    stream.add_argument(
+        "--sources",
+        nargs="+",
+        required=True,
+        metavar="URL",
+        help='tars of photos: paths, urls or patterns ("shards/{000..099}.tar"); or NAME=URL@WEIGHT for weighted sources (indoor=in.tar@0.7)',
+    )
+    stream.add_argument(
+        "--sources-from",
+        nargs="+",
+        action="append",
+        default=[],
+        metavar=("EPOCH", "URL"),
+        help="other sources from that epoch on; may be given several times",
+    )
+    stream.add_argument("--epoch-size", type=int, metavar="N", help="samples per epoch (default: one pass over the photos)")
+    stream.add_argument("--size", type=int, nargs=2, default=(384, 512), metavar=("HEIGHT", "WIDTH"), help="of the crops, multiples of 32 (default: 384 512)")
+    stream.add_argument("--depth", default="builtin", help='"builtin", or a Hub id or folder in the transformers format (default: builtin)')
+    stream.add_argument("--inpaint", default="builtin", help='"builtin", "background", or a Hub id or folder in the diffusers format (default: builtin)')
+    stream.add_argument("--disparity", choices=("adaptive", "uniform"), default="adaptive", help="the paper's ADS, or MfS-Stereo's uniform range")
+    stream.add_argument("--no-confidence", action="store_true", help="every label counts fully (no TCG)")
+    stream.add_argument("--no-augmentation", action="store_true", help="train on the clean pairs")
+    stream.add_argument("--seed", type=int, default=0, help="of the stream and of the fresh weights (default: 0)")
+    stream.add_argument("--workers", type=int, default=defaults.workers, help=f"processes that make pairs, per rank (default: {defaults.workers})")
+
+    training = parser.add_argument_group("the training")
+    training.add_argument("--steps", type=int, default=defaults.steps, help=f"optimizer steps in all (default: {defaults.steps:,})")
+    training.add_argument("--batch-size", type=int, default=defaults.batch_size, help=f"pairs per rank and step (default: {defaults.batch_size})")
+    training.add_argument("--accumulate", type=int, default=1, help="batches per optimizer step (default: 1)")
+    training.add_argument("--iterations", type=int, default=defaults.iterations, help=f"of the matcher, in training (default: {defaults.iterations})")
+    training.add_argument("--learning-rate", type=float, default=defaults.learning_rate, help=f"peak of the one-cycle (default: {defaults.learning_rate})")
+    training.add_argument("--mixed-precision", choices=("no", "bf16", "fp16"), help="default: what `accelerate launch` was told")
+    training.add_argument("--initial-weights", type=Path, metavar="FILE", help="a published or own checkpoint to start from (.pth or .safetensors)")
+    training.add_argument("--output", type=Path, required=True, metavar="DIR", help="the run's folder: checkpoints, logs, evaluation.json")
+    training.add_argument("--resume", type=Path, metavar="DIR", help="go on from the newest checkpoint of that run, or from that checkpoint")
+    training.add_argument("--save-every", type=int, default=defaults.save_every, help=f"steps between checkpoints (default: {defaults.save_every:,})")
+    training.add_argument("--tracker", default="tensorboard", help='one of Accelerate\'s trackers, or "none" (default: tensorboard)')
+
+    evaluation = parser.add_argument_group("the evaluation at the end")
+    evaluation.add_argument(
+        "--evaluate", nargs="+", default=[], metavar="WHAT", help='"motorcycle" (ships with scikit-image), or folders of stereo pairs with ground truth'
+    )
+    evaluation.add_argument("--evaluation-iterations", type=int, default=defaults.evaluation_iterations, help=f"default: {defaults.evaluation_iterations}")
+
+
+def open_stream(arguments: argparse.Namespace) -> ZeroStereoStream:
+    """The stream that the arguments describe."""
+    schedule: dict[int, Any] = {0: _sources(arguments.sources)}
+    for epoch, *urls in arguments.sources_from:
+        if not epoch.isdigit() or not urls:
+            raise ValueError(f"--sources-from takes an epoch and urls, such as: --sources-from 5 other.tar; got {' '.join([epoch, *urls])}")
+        schedule[int(epoch)] = _sources(urls)
+    return ZeroStereoStream(
+        schedule,
+        size=tuple(arguments.size),
+        depth=arguments.depth,
+        inpaint=arguments.inpaint,
+        disparity=AdaptiveDisparity() if arguments.disparity == "adaptive" else UniformDisparity(),
+        seed=arguments.seed,
+        epoch_size=arguments.epoch_size,
+        synthesis=SynthesisConfig(flip_confidence=not arguments.no_confidence),
+        augmentation=AugmentConfig.none() if arguments.no_augmentation else AugmentConfig(),
+    )
+
+
+def train_config(arguments: argparse.Namespace) -> TrainConfig:
+    """How to train, as the arguments say."""
+    names = ("steps", "batch_size", "iterations", "evaluation_iterations", "learning_rate", "accumulate", "workers", "mixed_precision", "save_every", "seed")
+    return TrainConfig(**{name: getattr(arguments, name) for name in names})
+
+
+def evaluation_pairs(arguments: argparse.Namespace) -> list[StereoPair]:
+    """The pairs of the final evaluation, read before the training so that a wrong path fails at once."""
+    pairs = []
+    for what in arguments.evaluate:
+        pairs += [motorcycle()] if what == "motorcycle" else [read_pair(folder) for folder in find_pairs(Path(what))]
+    return pairs
+
+
+def run(main: Any) -> None:
+    """Runs a trainer's main; a wrong argument or a missing file is one line in words, not a traceback."""
+    try:
+        main()
+    except (ValueError, FileNotFoundError, FileExistsError, NotADirectoryError) as error:
+        sys.exit(f"{Path(sys.argv[0]).name}: {error}")
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def _sources(specs: list[str]) -> Any:
+    if not any("=" in spec.split("://")[0] for spec in specs):
+        return specs
+    sources = {}
+    for spec in specs:
+        name, _, rest = spec.partition("=")
+        urls, _, weight = rest.rpartition("@")
+        if not urls:
+            urls, weight = rest, ""
+        if not name or not urls:
+            raise ValueError(f"a named source is NAME=URL or NAME=URL@WEIGHT; got {spec!r}")
+        try:
+            sources[name] = ImageSource(urls, weight=float(weight) if weight else None)
+        except ValueError:
+            raise ValueError(f"the weight in {spec!r} is no number") from None
+    return sources

@@ -1,0 +1,64 @@
+"""Trains RAFT-Stereo on pairs that are made while it trains.
+
+    accelerate launch trainers/raft.py --sources photos.tar --output runs/first
+    accelerate launch trainers/raft.py --sources photos.tar --output runs/first --resume runs/first
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from trainers.arguments import add_training_arguments, evaluation_pairs, open_stream, run, train_config
+from trainers.loop import train
+from trainers.models import load_checkpoint, load_matcher
+from zsdata import StereoBatch, zero_stereo_loss
+
+
+def sequence_loss(initial: Tensor | None, sequence: list[Tensor], batch: StereoBatch) -> tuple[Tensor, dict[str, Any]]:
+    """The ZeroStereo loss over RAFT-Stereo's sequence of predictions."""
+    return zero_stereo_loss(
+        sequence, batch.left_clean, batch.right_clean, batch.disparity, batch.confidence, batch.masks, initial_prediction=initial
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_training_arguments(parser)
+    model = parser.add_argument_group("RAFT-Stereo (defaults as published)")
+    model.add_argument("--hidden-dims", type=int, nargs=3, default=(128, 128, 128), help="channels of the GRUs, coarsest first (default: 128 128 128)")
+    model.add_argument("--corr-implementation", choices=("reg", "alt"), default="reg", help="alt saves memory, same numbers (default: reg)")
+    model.add_argument("--corr-levels", type=int, default=4, help="levels of the correlation pyramid (default: 4)")
+    model.add_argument("--corr-radius", type=int, default=4, help="of the lookup (default: 4)")
+    model.add_argument("--n-downsample", type=int, default=2, choices=(2, 3), help="features have 1/2^n of the resolution (default: 2)")
+    model.add_argument("--n-gru-layers", type=int, default=3, choices=(1, 2, 3), help="default: 3")
+    model.add_argument("--slow-fast-gru", action="store_true", help="update coarse GRUs more often")
+    model.add_argument("--shared-backbone", action="store_true", help="one encoder for features and context")
+    arguments = parser.parse_args()
+
+    names = ("hidden_dims", "corr_implementation", "corr_levels", "corr_radius", "n_downsample", "n_gru_layers", "slow_fast_gru", "shared_backbone")
+    options = {name: getattr(arguments, name) for name in names}
+    torch.manual_seed(arguments.seed)  # the fresh weights
+    matcher = load_matcher("raft_stereo", **options)
+    matcher.freeze_bn()
+    if arguments.initial_weights is not None:
+        load_checkpoint(matcher, arguments.initial_weights)
+    train(
+        matcher,
+        sequence_loss,
+        open_stream(arguments),
+        train_config(arguments),
+        output=arguments.output,
+        model_config={"model": "raft_stereo", "options": options},
+        arguments={name: str(value) for name, value in vars(arguments).items()},
+        resume=arguments.resume,
+        pairs=evaluation_pairs(arguments),
+        tracker=None if arguments.tracker == "none" else arguments.tracker,
+    )
+
+
+if __name__ == "__main__":
+    run(main)

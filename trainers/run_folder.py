@@ -1,0 +1,66 @@
+"""The folder of a training run: whole checkpoints, written beside and renamed, and the newest of them found again.
+
+    OUTPUT/checkpoints/step-00000500/model.safetensors    weights under their published names
+                                     config.json          which matcher with which options: what `evaluate.py` needs
+                                     training.pt          optimizer, schedule and gradient scaler (tensors and numbers only)
+                                     state.json           step, place in the stream, the run's arguments
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from trainers.models import save_checkpoint
+
+KEPT_CHECKPOINTS = 3
+
+
+def save(output: Path, step: int, matcher: nn.Module, config: dict[str, Any], training: dict[str, Any], state: dict[str, Any]) -> Path:
+    """Writes the checkpoint of `step` as a whole or not at all; older ones but the last few are removed afterwards."""
+    folder = output / "checkpoints" / f"step-{step:08d}"
+    unfinished = folder.with_name(f".{folder.name}.{os.getpid()}")
+    unfinished.mkdir(parents=True)
+    try:
+        save_checkpoint(matcher, unfinished / "model.safetensors")
+        (unfinished / "config.json").write_text(json.dumps(config, indent=2) + "\n")
+        torch.save(training, unfinished / "training.pt")
+        (unfinished / "state.json").write_text(json.dumps({"step": step, **state}, indent=2) + "\n")
+        if folder.exists():
+            shutil.rmtree(folder)
+        os.replace(unfinished, folder)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+    for old in _whole(output)[:-KEPT_CHECKPOINTS]:
+        shutil.rmtree(old)
+    return folder
+
+
+def newest(path: Path) -> Path:
+    """The checkpoint to resume from: `path` itself, or the newest one of the run in `path`.
+
+    Raises:
+        FileNotFoundError: there is none.
+    """
+    if (path / "state.json").is_file():
+        return path
+    checkpoints = _whole(path)
+    if not checkpoints:
+        raise FileNotFoundError(f"no checkpoint to resume from in {path}; give --resume the --output folder of a run or one of its checkpoints")
+    return checkpoints[-1]
+
+
+def load(checkpoint: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """(training, state) of a checkpoint, as they were given to `save`; weights are loaded by `trainers.models.load_checkpoint`."""
+    training = torch.load(checkpoint / "training.pt", map_location="cpu", weights_only=True)
+    return training, json.loads((checkpoint / "state.json").read_text())
+
+
+def _whole(output: Path) -> list[Path]:
+    return sorted(path for path in (output / "checkpoints").glob("step-*") if (path / "state.json").is_file())
