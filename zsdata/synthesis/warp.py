@@ -129,18 +129,14 @@ def _resample_rows(left: Tensor, first: Tensor, second: Tensor, share: Tensor, j
     ends_after = (1 - has_after).to(left.dtype).reshape(batch, height, width)
 
     t = share.reshape(batch, height, width)
-    weight_before = ((2 - t) * t - 1) * t * 0.5
-    weight_first = ((3 * t - 5) * t * t + 2) * 0.5
-    weight_second = ((4 - 3 * t) * t + 1) * t * 0.5
-    weight_after = (t - 1) * t * t * 0.5
     planes = []
     for channel in range(channels):
         plane = left[:, channel].reshape(-1)
         here, there, back, on = (plane.index_select(0, tap).reshape(t.shape) for tap in (first, second, before, after))
         step = there - here
         back, on = back - ends_before * step, on + ends_after * step  # past the end of a surface its colour goes on straight
-        value = back * weight_before + here * weight_first + there * weight_second + on * weight_after
-        planes.append(value)
+        curve = 2 * back - 5 * here + 4 * there - on  # Horner's form: equal colours give exactly that colour
+        planes.append(here + 0.5 * t * (there - back + t * (curve + t * (3 * (here - there) + on - back))))
     low, high = left.amin((1, 2, 3), keepdim=True), left.amax((1, 2, 3), keepdim=True)
     return torch.stack(planes, 1).clamp(low, high)
 
