@@ -1,0 +1,103 @@
+"""From what a user writes to the list of shards."""
+
+from pathlib import Path
+
+import pytest
+
+from zsdata.source.urls import base_name, expand_urls, local_path
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for number in range(12):
+        (tmp_path / f"s-{number:02d}.tar").write_bytes(b"")
+    (tmp_path / "notes.txt").write_text("no shard")
+    (tmp_path / ".s-99.tar").write_bytes(b"")
+    return tmp_path
+
+
+def named(folder, *numbers):
+    return [f"{folder}/s-{number:02d}.tar" for number in numbers]
+
+
+def test_braces_expand_in_order(folder):
+    assert expand_urls(f"{folder}/s-{{00..11}}.tar") == named(folder, *range(12))
+    assert expand_urls(f"{folder}/s-{{03,01}}.tar") == named(folder, 3, 1)
+
+
+def test_a_glob_and_a_folder_are_sorted(folder):
+    assert expand_urls(f"{folder}/*.tar") == expand_urls(str(folder)) == expand_urls(folder) == named(folder, *range(12))
+
+
+def test_a_list_keeps_its_order(folder):
+    assert expand_urls([folder / "s-05.tar", f"{folder}/s-0{{1,0}}.tar"]) == named(folder, 5, 1, 0)
+
+
+def test_a_path_that_exists_is_taken_as_it_is(tmp_path):
+    odd = tmp_path / "s-{0..1}[*].tar"
+    odd.write_bytes(b"")
+    assert expand_urls(odd) == [str(odd)]
+
+
+@pytest.mark.parametrize("url", ["http://host/s-{00..01}.tar?x=1", "memory://a/s-{00..01}.tar"])
+def test_remote_urls_pass_with_their_braces_expanded(url):
+    assert expand_urls(url) == [url.replace("{00..01}", "00"), url.replace("{00..01}", "01")]
+
+
+def test_file_urls_are_local(folder):
+    url = f"file://{folder}/s-00.tar"
+    assert expand_urls(url) == [url] and local_path(url) == f"{folder}/s-00.tar"
+    with pytest.raises(FileNotFoundError):
+        expand_urls(f"file://{folder}/missing.tar")
+
+
+@pytest.mark.parametrize("url", ["pipe:cat x.tar", "{pipe:curl x,a.tar}", Path("pipe:cat x.tar")])
+def test_pipe_urls_are_refused_by_name(url):
+    with pytest.raises(ValueError, match="pipe: urls run shell commands"):
+        expand_urls(url)
+
+
+@pytest.mark.parametrize(
+    ("spec", "error", "says"),
+    [
+        ("a.tar::b.tar", ValueError, '"::" is not supported; give a list'),
+        ("simplecache::http://host/a.tar", ValueError, '"::" is not supported'),
+        ("nonsense://host/a.tar", ValueError, "fsspec"),
+        ("http://host/*.tar", ValueError, "globs find local shards only"),
+        ("s-{00..11.tar", ValueError, "unbalanced braces"),
+        ("", ValueError, "empty"),
+        ([], ValueError, "at least one tar"),
+        (7, TypeError, "got 7"),
+        (b"a.tar", TypeError, "got b'a.tar'"),
+        ([b"a.tar"], TypeError, "got b'a.tar'"),
+        ("missing.tar", FileNotFoundError, "missing.tar does not exist; check the path"),
+        ("missing-*.tar", FileNotFoundError, "matches no file; check the pattern"),
+        ("/dev/null", ValueError, "neither a file nor a folder"),
+    ],
+)
+def test_a_bad_specification_is_an_error_with_its_cure(spec, error, says):
+    with pytest.raises(error, match=says):
+        expand_urls(spec)
+
+
+def test_a_missing_shard_of_a_range_is_named(folder):
+    with pytest.raises(FileNotFoundError, match=r"s-12.tar \(from '.*s-\{00..12\}.tar'\) does not exist; check .* the range"):
+        expand_urls(f"{folder}/s-{{00..12}}.tar")
+
+
+def test_a_folder_without_tars_says_what_to_do(tmp_path):
+    with pytest.raises(FileNotFoundError, match="zsdata pack"):
+        expand_urls(tmp_path)
+    (tmp_path / "a.tar.gz").write_bytes(b"")
+    with pytest.raises(FileNotFoundError, match="gunzip"):
+        expand_urls(tmp_path)
+
+
+def test_a_shard_named_twice_is_an_error(folder):
+    for twice in (f"{folder}/./s-03.tar", f"file://{folder}/s-03.tar"):
+        with pytest.raises(ValueError, match=r"s-03.tar is named twice"):
+            expand_urls([folder, twice])
+
+
+def test_the_name_of_a_shard_has_no_folder_and_no_token():
+    assert base_name("/a/b/c.tar") == base_name("https://h/x/c.tar?token=1#2") == base_name("s3://bucket/c.tar") == "c.tar"

@@ -1,0 +1,133 @@
+"""The photos of one shard, in order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+from zsdata.faults import BadShard
+from zsdata.source.ranges import ShardFile, ends_inside
+from zsdata.source.tar import walk_tar
+
+PHOTO_EXTENSIONS = frozenset({"jpg", "jpeg", "png", "webp"})
+OTHER_IMAGE_EXTENSIONS = frozenset(  # of files that a user may take for photos of the source; they are counted, not passed over
+    {
+        "gif",
+        "bmp",
+        "tif",
+        "tiff",
+        "heic",
+        "heif",
+        "avif",
+        "jfif",
+        "jpe",
+        "jp2",
+        "jxl",
+        "ppm",
+        "pgm",
+        "tga",
+        "psd",
+        "dng",
+        "cr2",
+        "nef",
+        "arw",
+        "raw",
+    }
+)
+MAX_PHOTO_BYTES = 1 << 29  # 512 MiB; a 100-megapixel photo has 20 to 300 MB
+
+
+class PhotoMember(NamedTuple):
+    """A photo's bytes in its shard; `key` is its name up to the first dot of the base name."""
+
+    key: str
+    offset: int
+    size: int
+
+
+class Problem(NamedTuple):
+    """What is not there to be used: a damage of the shard (`key` is None) or a member that cannot be taken as a photo."""
+
+    shard: str
+    key: str | None
+    offset: int
+    reason: str
+
+
+def split_name(name: str) -> tuple[str, str] | None:
+    """A member's key and lower-case extension by the rule of webdataset: they part at the first dot of the base name.
+
+    "a.b/KEY.depth.PNG" has the key "a.b/KEY" and the extension "depth.png". None without a dot, and for members that belong to no
+    sample: hidden files (also the "._NAME" of macOS) and what lies in "__MACOSX".
+    """
+    folder, slash, base = name.rpartition("/")
+    stem, dot, extension = base.partition(".")
+    if not stem or not dot or "__MACOSX" in folder.split("/"):
+        return None
+    return folder + slash + stem, extension.lower()
+
+
+def photo_members(file: ShardFile, on_problem: Callable[[Problem], None], *, strict: bool = False) -> Iterator[PhotoMember]:
+    """The photos of an open shard: regular members with the extension jpg, jpeg, png or webp.
+
+    Args:
+        on_problem: gets the damages, and each member that is meant as a photo but is none: the second of a key, a link, another format.
+        strict: damage raises instead.
+
+    Raises:
+        BadShard: damage, when `strict`.
+    """
+
+    def on_damage(fault: BadShard) -> None:
+        on_problem(Problem(fault.shard, None, fault.offset, fault.reason))
+
+    keys: set[str] = set()
+    for member in walk_tar(file, None if strict else on_damage):
+        named = split_name(member.name)
+        if named is None or member.kind == "folder":
+            continue
+        key, extension = named
+        if extension in PHOTO_EXTENSIONS:
+            if member.kind != "file":
+                reason = f"not a regular file: {member.kind}"
+            elif key in keys:
+                reason = "duplicate key"
+            elif member.size > MAX_PHOTO_BYTES:
+                reason = f"too large: {member.size:,} bytes, at most {MAX_PHOTO_BYTES:,}"
+            else:
+                keys.add(key)
+                yield PhotoMember(key, member.offset, member.size)
+                continue
+        elif extension in OTHER_IMAGE_EXTENSIONS:
+            reason = f"not a JPEG, PNG or WebP: .{extension}"
+        else:
+            continue
+        on_problem(Problem(file.url, key, member.offset, reason))
+
+
+def read_shard(url: str, on_damage: Callable[[BadShard], None] | None = None) -> Iterator[tuple[str, bytes]]:
+    """The photos of one uncompressed tar, in order, as they are stored.
+
+    Args:
+        url: a path or a url that fsspec opens.
+        on_damage: gets what is damaged or cannot be taken (a duplicate key, another image format), and the reading goes on where that is
+            safe. No part of a photo is ever yielded. Without it, damage raises, and of two photos with one key the first is yielded.
+
+    Yields:
+        key, bytes of a JPEG, PNG or WebP file (not yet looked at: `decode_photo` says whether they are one).
+
+    Raises:
+        BadShard: the tar is damaged, and there is no `on_damage`.
+    """
+
+    def report(problem: Problem) -> None:
+        if on_damage is not None:
+            of_key = "" if problem.key is None else f' ("{problem.key}")'
+            on_damage(BadShard(problem.reason + of_key, problem.shard, problem.offset))
+
+    with ShardFile(url) as file:
+        for key, offset, size in photo_members(file, report, strict=on_damage is None):
+            data = file.read_at(offset, size)
+            if len(data) < size:
+                raise ends_inside(url, f'"{key}"', offset, size, len(data))
+            yield key, data

@@ -1,0 +1,136 @@
+"""What photos a source holds and where each of them lies, found once."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+from array import array
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from zsdata.source.archive import Problem, photo_members
+from zsdata.source.ranges import ShardFile, read_range
+from zsdata.source.tar import walk_tar
+from zsdata.source.urls import base_name, expand_urls
+
+
+class Member(NamedTuple):
+    """One photo: `size` bytes at `offset` of a shard."""
+
+    shard_url: str
+    key: str
+    offset: int
+    size: int
+
+
+@dataclass(frozen=True, eq=False)
+class Manifest:
+    """The photos of one source in the order of its shards and of their members; small enough to send to every worker.
+
+    `digest` (sha256, hexadecimal) stands for all of it but the folder or host that the shards lie in: the same shards have the same digest
+    anywhere. `problems` lists what could not be taken.
+    """
+
+    shard_urls: tuple[str, ...]
+    shard_sizes: tuple[int, ...]  # bytes
+    shard_numbers: np.ndarray  # [N] int32, into shard_urls
+    offsets: np.ndarray  # [N] int64, bytes
+    sizes: np.ndarray  # [N] int32, bytes
+    key_text: bytes  # all keys, one after the other
+    key_ends: np.ndarray  # [N] int64, into key_text
+    problems: tuple[Problem, ...]
+    digest: str
+
+    def __len__(self) -> int:
+        """How many photos."""
+        return len(self.offsets)
+
+    def member(self, index: int) -> Member:
+        """Photo `index`, 0 <= index < len(self)."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"photo {index} of a source with {len(self):,}")
+        start = int(self.key_ends[index - 1]) if index else 0
+        key = self.key_text[start : int(self.key_ends[index])].decode("utf-8", "surrogateescape")
+        return Member(self.shard_urls[self.shard_numbers[index]], key, int(self.offsets[index]), int(self.sizes[index]))
+
+    def read(self, index: int) -> bytes:
+        """The bytes of photo `index`, read by range; raises BadShard if the shard no longer has all of them."""
+        url, key, offset, size = self.member(index)
+        return read_range(url, offset, size, inside=f'"{key}"')
+
+
+def build_manifest(urls: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], progress: bool = False) -> Manifest:
+    """Walks the headers of a source's shards.
+
+    Args:
+        urls: as `expand_urls` takes them.
+        progress: show a progress bar even where stderr is no terminal.
+
+    Raises:
+        ValueError: not one photo in all the shards; the message says what was found.
+        FileNotFoundError and others: as `expand_urls` raises them, and what opening a shard raises.
+    """
+    shard_urls = expand_urls(urls)
+    shard_sizes: list[int] = []
+    shard_numbers, offsets, sizes, key_ends = array("i"), array("q"), array("i"), array("q")
+    key_text = bytearray()
+    problems: list[Problem] = []
+    hidden = not (progress or (len(shard_urls) > 1 and sys.stderr.isatty()))
+    for number, url in enumerate(tqdm(shard_urls, desc="indexing", unit="shard", disable=hidden)):
+        with ShardFile(url) as file:
+            shard_sizes.append(file.size)
+            for key, offset, size in photo_members(file, problems.append):
+                key_text += key.encode("utf-8", "surrogateescape")
+                shard_numbers.append(number)
+                offsets.append(offset)
+                sizes.append(size)
+                key_ends.append(len(key_text))
+    if not offsets:
+        raise ValueError(_nothing_found(shard_urls, problems))
+    columns = {
+        "shard_numbers": np.array(shard_numbers, np.int32),
+        "offsets": np.array(offsets, np.int64),
+        "sizes": np.array(sizes, np.int32),
+        "key_text": bytes(key_text),
+        "key_ends": np.array(key_ends, np.int64),
+    }
+    return Manifest(
+        shard_urls=tuple(shard_urls),
+        shard_sizes=tuple(shard_sizes),
+        problems=tuple(problems),
+        digest=_digest(shard_urls, shard_sizes, columns),
+        **columns,
+    )
+
+
+def _digest(urls: Sequence[str], sizes: Sequence[int], columns: dict[str, np.ndarray | bytes]) -> str:
+    digest = hashlib.sha256(b"zsdata manifest 1\n")
+    for url, size in zip(urls, sizes, strict=True):
+        name = base_name(url).encode("utf-8", "surrogateescape")
+        digest.update(b"shard %d %d %s\n" % (size, len(name), name))
+    for title, column in columns.items():
+        data = column if isinstance(column, bytes) else column.astype(column.dtype.newbyteorder("<")).tobytes()
+        digest.update(b"%s %d\n" % (title.encode(), len(data)))
+        digest.update(data)
+    return digest.hexdigest()
+
+
+def _nothing_found(urls: Sequence[str], problems: Sequence[Problem]) -> str:
+    """The message for a source without photos: what its first shard holds, and the first problems."""
+    with ShardFile(urls[0]) as file:
+        extensions = Counter(
+            "." + base.partition(".")[2] if "." in base else "files without a dot"
+            for base in (member.name.rpartition("/")[2] for member in walk_tar(file, lambda fault: None) if member.kind == "file")
+        )
+    found = ", ".join(f"{count:,} {extension}" for extension, count in extensions.most_common(5)) or "no files"
+    shards = urls[0] if len(urls) == 1 else f"{len(urls):,} shards (the first is {urls[0]})"
+    message = f"no JPEG, PNG or WebP in {shards}: it holds {found}"
+    if problems:
+        message += "; " + "; ".join(f"{problem.key or base_name(problem.shard)}: {problem.reason}" for problem in problems[:3])
+    return message + ". A photo is a member named KEY.jpg, .jpeg, .png or .webp; `zsdata pack FOLDER OUTPUT` makes such shards"

@@ -1,0 +1,195 @@
+"""A folder of photographs to shards, bytes unchanged."""
+
+from __future__ import annotations
+
+import os
+import re
+import tarfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+from tqdm import tqdm
+
+from zsdata.faults import BadPhoto
+from zsdata.source.archive import MAX_PHOTO_BYTES, OTHER_IMAGE_EXTENSIONS, PHOTO_EXTENSIONS
+from zsdata.source.photo import decode_rgb, photo_extension
+
+_BLOCK = 512
+_END_OF_ARCHIVE = bytes(2 * _BLOCK)
+
+
+@dataclass
+class PackReport:
+    """What was packed and what was not."""
+
+    photos: int = 0
+    bytes: int = 0  # of the shards
+    shards: list[str] = field(default_factory=list)  # their paths, in order
+    skipped: list[tuple[str, str]] = field(default_factory=list)  # path in the folder, reason
+
+
+def pack(
+    folder: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    photos_per_shard: int = 1000,
+    overwrite: bool = False,
+    progress: bool | None = None,
+) -> PackReport:
+    """Packs the photos in `folder` and its subfolders, sorted by path, into OUTPUT/NAME-000000.tar and so on; NAME is the folder's.
+
+    Every photo is decoded once: what zsdata cannot use is left out and reported. Bytes are copied as they are, originals stay untouched.
+    A photo's key is its path without the extension, dots in its base name written as "_"; a key that is taken gets "_2", "_3" appended.
+    Its extension is that of its content. The same folder gives the same bytes. Hidden files and files that are no images are passed over;
+    symbolic links are read through.
+
+    Args:
+        overwrite: replace shards that `pack` made before under the same name.
+        progress: show a progress bar; by default where stderr is a terminal.
+
+    Raises:
+        NotADirectoryError: `folder` is no folder.
+        FileExistsError: `output` already holds tars.
+        ValueError: there is no photo to pack, or `photos_per_shard` is not positive.
+    """
+    source, target = Path(folder), Path(output)
+    if not source.is_dir():
+        raise NotADirectoryError(f"{source} is not a folder; pack takes a folder of photographs")
+    if photos_per_shard < 1:
+        raise ValueError(f"photos_per_shard is at least 1, got {photos_per_shard}")
+    name = re.sub(r"[^A-Za-z0-9_-]", "_", source.resolve().name) or "photos"
+    _check_output(target, name, overwrite)
+    files = sorted(_image_files(source, target), key=os.fsencode)
+    target.mkdir(parents=True, exist_ok=True)
+    report, keys = PackReport(), set()
+    with _Shards(target, name, photos_per_shard) as shards:
+        for path in tqdm(files, desc="packing", unit="photo", disable=None if progress is None else not progress):
+            try:
+                data, extension = _read_photo(source / path)
+            except BadPhoto as fault:
+                report.skipped.append((path, fault.reason))
+                continue
+            shards.add(f"{_free_key(path, keys)}.{extension}", data)
+            report.photos += 1
+        if not report.photos:
+            skipped = "".join(f"; {path}: {reason}" for path, reason in report.skipped[:3])
+            raise ValueError(f"no photo to pack in {source}: a photo is a JPEG, PNG or WebP file{skipped}")
+        report.shards = [os.fspath(path) for path in shards.publish()]
+    report.bytes = sum(os.path.getsize(path) for path in report.shards)
+    return report
+
+
+class _Shards:
+    """The shards as they are written: under other names until all are there, removed if that never happens."""
+
+    def __init__(self, target: Path, name: str, photos_per_shard: int) -> None:
+        self._target = target
+        self._name = name
+        self._photos_per_shard = photos_per_shard
+        self._photos = 0
+        self._partial: list[Path] = []
+        self._file: BinaryIO | None = None
+
+    def add(self, name: str, data: bytes) -> None:
+        if self._file is None:
+            path = self._target / f"{self._name}-{len(self._partial):06d}.tar.partial"
+            path.unlink(missing_ok=True)  # left by a run that was killed
+            self._file = open(path, "xb")
+            self._partial.append(path)
+        self._file.write(_header(name, len(data)))
+        self._file.write(data)
+        self._file.write(bytes(-len(data) % _BLOCK))
+        self._photos += 1
+        if self._photos % self._photos_per_shard == 0:
+            self._finish()
+
+    def publish(self) -> list[Path]:
+        """Gives all shards their names, and removes what an earlier, longer pack left behind them."""
+        self._finish()
+        shards = [path.with_suffix("") for path in self._partial]
+        for path, shard in zip(self._partial, shards, strict=True):
+            os.replace(path, shard)
+        for old in set(_shards_of(self._target, self._name)) - set(shards):
+            old.unlink()
+        return shards
+
+    def _finish(self) -> None:
+        if self._file is not None:
+            self._file.write(_END_OF_ARCHIVE)
+            self._file.close()
+            self._file = None
+
+    def __enter__(self) -> _Shards:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        if self._file is not None:
+            self._file.close()
+        for path in self._partial:
+            path.unlink(missing_ok=True)
+
+
+def _check_output(target: Path, name: str, overwrite: bool) -> None:
+    if target.exists() and not target.is_dir():
+        raise NotADirectoryError(f"{target} is not a folder; pack writes its shards into a folder")
+    present = sorted(target.glob("*.tar")) if target.exists() else []
+    if present and not overwrite:
+        raise FileExistsError(f"{target} already holds {present[0].name}; choose another folder, or allow to overwrite")
+    others = sorted(set(present) - set(_shards_of(target, name)))
+    if others:
+        raise FileExistsError(f"{target} holds {others[0].name}, which is no shard of {name!r}; choose another folder")
+
+
+def _shards_of(target: Path, name: str) -> list[Path]:
+    return [path for path in target.glob("*.tar") if re.fullmatch(re.escape(name) + r"-[0-9]{6}\.tar", path.name)]
+
+
+def _image_files(source: Path, output: Path, ancestors: tuple[str, ...] = (), below: str = "") -> Iterator[str]:
+    """Paths of the images below `source`, relative to it; through links, but not round in circles, and not into `output`."""
+    real = os.path.realpath(source / below)
+    if real in ancestors or real == os.path.realpath(output):
+        return
+    with os.scandir(source / below) as entries:
+        for entry in entries:
+            if entry.name.startswith(".") or entry.name == "__MACOSX":
+                continue
+            if entry.is_dir():
+                yield from _image_files(source, output, (*ancestors, real), below + entry.name + "/")
+            elif entry.name.rpartition(".")[2].lower() in PHOTO_EXTENSIONS | OTHER_IMAGE_EXTENSIONS:
+                yield below + entry.name
+
+
+def _read_photo(path: Path) -> tuple[bytes, str]:
+    """A photo's bytes and the extension that fits them; BadPhoto if zsdata cannot use it."""
+    try:
+        if not path.is_file():
+            raise BadPhoto("not a file, or a link to nothing")
+        size = path.stat().st_size
+        if size > MAX_PHOTO_BYTES:
+            raise BadPhoto(f"too large: {size:,} bytes, at most {MAX_PHOTO_BYTES:,}")
+        data = path.read_bytes()
+    except OSError as error:
+        raise BadPhoto(f"cannot be read: {error.strerror}") from error
+    decode_rgb(data)
+    return data, photo_extension(data)
+
+
+def _free_key(path: str, keys: set[str]) -> str:
+    folder, slash, base = path.rpartition("/")
+    stem = base.rpartition(".")[0].replace(".", "_")
+    key, number = folder + slash + stem, 1
+    while key in keys:
+        number += 1
+        key = f"{folder}{slash}{stem}_{number}"
+    keys.add(key)
+    return key
+
+
+def _header(name: str, size: int) -> bytes:
+    """Nothing in it but the name and the size, so that the same photos give the same shards."""
+    member = tarfile.TarInfo(name)
+    member.size = size
+    member.mode = 0o644
+    return member.tobuf(tarfile.GNU_FORMAT, "utf-8", "surrogateescape")

@@ -1,0 +1,102 @@
+"""The bytes of a photo to its pixels, the right way up, or the reason why not."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from zsdata.faults import BadPhoto
+from zsdata.source import jpeg, png
+from zsdata.source.exif import make_upright
+from zsdata.source.jpeg import Jpeg
+from zsdata.source.png import Png
+from zsdata.source.webp import WebP
+
+MAX_PIXELS = 100_000_000  # 300 MB of RGB; what any camera makes, and no bomb
+MAX_SIDE = 65_535  # pixels; as JPEG has it
+
+_OTHERS = (  # at byte, signature, name
+    (0, b"GIF8", "GIF"),
+    (0, b"BM", "BMP"),
+    (0, b"II*\0", "TIFF"),
+    (0, b"MM\0*", "TIFF"),
+    (4, b"ftypavi", "AVIF"),
+    (4, b"ftyphei", "HEIC"),
+    (4, b"ftyphev", "HEIC"),
+    (4, b"ftypmi", "HEIC"),
+    (4, b"ftyp", "a video"),
+    (0, b"\0\0\0\x0cjP", "JPEG 2000"),
+    (0, b"\0\0\0\x0cJXL", "JPEG XL"),
+    (0, b"\xff\x0a", "JPEG XL"),
+    (0, b"8BPS", "Photoshop"),
+    (0, b"\0\0\1\0", "an icon"),
+    (0, b"%PDF", "PDF"),
+    (0, b"PK\x03\x04", "a zip"),
+    (0, b"\x1f\x8b", "gzip"),
+    (0, b"version https://git-lfs", "a Git LFS pointer"),
+    (0, b"<", "HTML or XML"),
+)
+
+
+def decode_photo(data: bytes) -> Tensor:
+    """A JPEG, PNG or WebP file to uint8 [3, H, W], RGB, as it is meant to be seen.
+
+    The EXIF orientation is applied; grey, palette and CMYK become RGB; 16 bits are rounded to 8; what is transparent is laid over white;
+    an animation gives its first frame. Colour profiles are not applied.
+
+    Raises:
+        BadPhoto: another format, damaged or cut off (no part of such a photo is returned), or larger than MAX_PIXELS.
+    """
+    return torch.from_numpy(decode_rgb(data)).permute(2, 0, 1).contiguous()
+
+
+def decode_rgb(data: bytes) -> np.ndarray:
+    """As `decode_photo`, to uint8 [H, W, 3]."""
+    photo = _open(data)
+    image = photo.decode()
+    if image.shape != (photo.height, photo.width, 3):
+        raise BadPhoto(f"damaged: {image.shape[1]} x {image.shape[0]} pixels where the header says {photo.width} x {photo.height}")
+    return make_upright(image, photo.orientation)
+
+
+def probe_size(data: bytes) -> tuple[int, int]:
+    """Width and height in pixels of what `decode_photo` would return, without decoding; raises BadPhoto as far as it can know."""
+    photo = _open(data)
+    return (photo.height, photo.width) if photo.orientation >= 5 else (photo.width, photo.height)
+
+
+def photo_extension(data: bytes) -> str:
+    """The usual extension for what these bytes are: "jpg", "png" or "webp"; raises BadPhoto as `probe_size` does."""
+    return _open(data).extension
+
+
+def _open(data: bytes) -> Jpeg | Png | WebP:
+    """The file by its first bytes, its structure checked and its size within the limits."""
+    if not isinstance(data, bytes):
+        raise TypeError(f"a photo is the bytes of a file, got {type(data).__name__}")
+    if data.startswith(jpeg.SIGNATURE):
+        photo = Jpeg.parse(data)
+    elif data.startswith(png.SIGNATURE):
+        photo = Png.parse(data)
+    elif data.startswith(b"RIFF") and data[8:12] == b"WEBP":
+        photo = WebP.parse(data)
+    else:
+        raise BadPhoto(_what_else(data))
+    width, height = photo.width, photo.height
+    if not width or not height:
+        raise BadPhoto(f"damaged: {width} x {height} pixels")
+    if max(width, height) > MAX_SIDE or width * height > MAX_PIXELS:
+        raise BadPhoto(f"too large: {width:,} x {height:,} pixels, at most {MAX_PIXELS // 1_000_000} megapixels and {MAX_SIDE:,} a side")
+    return photo
+
+
+def _what_else(data: bytes) -> str:
+    if not data:
+        return "empty file"
+    if not data.strip(b"\0"):
+        return "only zeros"
+    for position, signature, name in _OTHERS:
+        if data.startswith(signature, position):
+            return f"not a JPEG, PNG or WebP: {name}"
+    return "not a JPEG, PNG or WebP: unknown format"

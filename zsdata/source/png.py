@@ -1,0 +1,76 @@
+"""PNG: what its chunks say, whether they are whole, and its pixels."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from zsdata.faults import BadPhoto
+from zsdata.source.exif import read_orientation
+from zsdata.source.opencv import decode_color, decode_over_white
+
+SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+_GREY, _GREY_ALPHA, _RGB_ALPHA = 0, 4, 6  # colour types
+
+
+@dataclass(frozen=True)
+class Png:
+    """A PNG whose chunks are all there with the right checksums; sides in pixels, as stored."""
+
+    extension: ClassVar[str] = "png"
+
+    data: bytes
+    width: int
+    height: int
+    bits: int  # per channel
+    color_type: int
+    transparency: bytes | None  # the tRNS chunk
+    orientation: int
+
+    @staticmethod
+    def parse(data: bytes) -> Png:
+        """Reads all chunks; of an animation it keeps the default image, which viewers that know no animation show."""
+        header, transparency, orientation = b"", None, 1
+        animated = has_pixels = False
+        still = [SIGNATURE]
+        kind, position = b"", len(SIGNATURE)
+        while kind != b"IEND":
+            start = position + 8
+            end = start + int.from_bytes(data[position : position + 4], "big")
+            kind = data[position + 4 : start]
+            if end + 4 > len(data):
+                raise BadPhoto("truncated: ends inside the PNG chunks")
+            if zlib.crc32(data[position + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+                raise BadPhoto(f"damaged: wrong checksum of the PNG chunk {kind.decode('latin-1')!r}")
+            if kind == b"IHDR" and not header:
+                header = data[start:end]
+            elif kind == b"tRNS":
+                transparency = data[start:end]
+            elif kind == b"eXIf":
+                orientation = read_orientation(data[start:end])
+            animated |= kind == b"acTL"
+            has_pixels |= kind == b"IDAT"
+            position = end + 4
+            if kind[:1].isupper() or kind == b"tRNS":  # what a decoder needs, without the further frames
+                still.append(data[start - 8 : position])
+        if len(header) != 13 or not has_pixels:
+            raise BadPhoto("damaged: a PNG without header or image data")
+        width, height = int.from_bytes(header[:4], "big"), int.from_bytes(header[4:8], "big")
+        return Png(b"".join(still) if animated else data, width, height, header[8], header[9], transparency, orientation)
+
+    def decode(self) -> np.ndarray:
+        """uint8 [height, width, 3] RGB over white; 16 bits are rounded to 8."""
+        if self.bits <= 8 and self.transparency is None and self.color_type not in (_GREY_ALPHA, _RGB_ALPHA):
+            return decode_color(self.data)
+        return decode_over_white(self.data, self._transparent_grey())
+
+    def _transparent_grey(self) -> int | None:
+        """OpenCV knows the transparent entries of a palette and a transparent colour, but not a transparent grey."""
+        if self.color_type != _GREY or self.transparency is None or len(self.transparency) != 2:
+            return None
+        value = int.from_bytes(self.transparency, "big") & ((1 << self.bits) - 1)
+        return value if self.bits >= 8 else value * 255 // ((1 << self.bits) - 1)

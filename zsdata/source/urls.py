@@ -1,0 +1,116 @@
+"""Which shards a source names: braces, globs and folders to a list of urls."""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections.abc import Sequence
+
+import fsspec
+from braceexpand import braceexpand
+
+
+def local_path(url: str) -> str | None:
+    """The path of a local url (a plain path or file://...), or None for a remote one."""
+    if url.startswith("file://"):
+        return url[len("file://") :]
+    return None if "://" in url else url
+
+
+def base_name(url: str) -> str:
+    """The file name in a url, without folder, host or the query of an http address (which may hold a changing token)."""
+    if url.startswith(("http://", "https://")):
+        url = url.split("?", 1)[0].split("#", 1)[0]
+    return url.rstrip("/").rpartition("/")[2]
+
+
+def expand_urls(urls: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) -> list[str]:
+    """The shards that a source names, in a fixed order.
+
+    Args:
+        urls: one specification or a sequence of them. A specification is a path; a folder (all its *.tar, sorted); a pattern with braces as
+            in webdataset ("shards/{000..099}.tar"); a local glob ("shards/*.tar", sorted); or a url that fsspec can open (http, https, s3,
+            gs, hf, file, memory), braces allowed. A local path that exists is taken as it is, whatever characters are in it.
+
+    Raises:
+        FileNotFoundError: a local shard is missing, or a folder or glob holds no tar.
+        ValueError: nothing is named, a shard is named twice, or the url is of a kind that zsdata does not open (`pipe:`, `::`, unknown).
+    """
+    if isinstance(urls, (str, os.PathLike)):
+        urls = [urls]
+    elif not isinstance(urls, Sequence) or isinstance(urls, (bytes, bytearray)):
+        raise TypeError(f'urls are a path, a pattern such as "shards/{{000..099}}.tar", or a list of them; got {urls!r}')
+    expanded = [url for spec in urls for url in _expand_one(os.fspath(spec))]
+    if not expanded:
+        raise ValueError("no shards: the list of urls is empty; name at least one tar")
+    seen: set[str] = set()
+    for url in expanded:
+        path = local_path(url)
+        identity = url if path is None else os.path.realpath(path)
+        if identity in seen:
+            raise ValueError(f"{url} is named twice; each shard may be in a source once (weights make photos more frequent)")
+        seen.add(identity)
+    return expanded
+
+
+def _expand_one(spec: str) -> list[str]:
+    if not isinstance(spec, str):
+        raise TypeError(f"a url is text or a path, got {spec!r}")
+    if not spec:
+        raise ValueError("a url is empty; name a tar, a folder of tars, or a pattern")
+    if os.path.exists(spec):
+        return _local_shards(spec, spec, spec)
+    try:
+        names = list(braceexpand(spec))
+    except ValueError as error:
+        raise ValueError(f'{spec!r} has unbalanced braces; a range is written as in "shards/{{000..099}}.tar"') from error
+    shards = []
+    for url in names:
+        if url.startswith("pipe:"):
+            raise ValueError(
+                f"{url!r}: pipe: urls run shell commands and are refused; name the tar itself (a path, http, s3, gs or hf url)"
+            )
+        if "::" in url:
+            raise ValueError(f'{url!r}: "::" is not supported; give a list of urls, or for chained file systems the url of the tar itself')
+        path = local_path(url)
+        shards += _remote_shards(url, spec) if path is None else _local_shards(path, url, spec)
+    return shards
+
+
+def _remote_shards(url: str, spec: str) -> list[str]:
+    protocol = url.split("://", 1)[0]
+    try:
+        fsspec.get_filesystem_class(protocol)
+    except ImportError:  # known, but its package is missing: an error when a shard is opened
+        pass
+    except ValueError as error:
+        raise ValueError(f"{spec!r}: {protocol}:// is no kind of url that fsspec knows; use http, https, s3, gs, hf or a path") from error
+    if "*" in url:
+        raise ValueError(f'{spec!r}: globs find local shards only; name remote ones with braces, as in "{protocol}://.../{{000..099}}.tar"')
+    return [url]
+
+
+def _local_shards(path: str, url: str, spec: str) -> list[str]:
+    of_spec = "" if spec == url else f" (from {spec!r})"
+    if os.path.isdir(path):
+        found = sorted(os.path.join(path, name) for name in os.listdir(path) if name.endswith(".tar") and not name.startswith("."))
+        if not found:
+            raise FileNotFoundError(f"{url}{of_spec} is a folder without *.tar{_packed_hint(path)}")
+        return found
+    if os.path.isfile(path):
+        return [url]
+    if os.path.exists(path):
+        raise ValueError(f"{url}{of_spec} is neither a file nor a folder; a shard is an uncompressed tar file")
+    if glob.has_magic(path):
+        found = sorted(name for name in glob.glob(path) if os.path.isfile(name))
+        if not found:
+            raise FileNotFoundError(f"{url}{of_spec} matches no file; check the pattern, it is taken from {os.getcwd()}")
+        return found
+    raise FileNotFoundError(f"{url}{of_spec} does not exist; check the path and the range of the braces")
+
+
+def _packed_hint(folder: str) -> str:
+    names = os.listdir(folder)
+    if any(name.lower().endswith((".tar.gz", ".tgz")) for name in names):
+        return "; its .tar.gz must be unpacked to .tar first (gunzip)"
+    return "; photos in a folder become shards with `zsdata pack FOLDER OUTPUT`"

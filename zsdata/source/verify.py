@@ -1,0 +1,87 @@
+"""Every shard walked and every photo decoded: what a stream would trip over, found before training."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from tqdm import tqdm
+
+from zsdata.faults import BadPhoto
+from zsdata.source.archive import Problem, photo_members
+from zsdata.source.photo import decode_rgb
+from zsdata.source.ranges import ShardFile
+from zsdata.source.urls import base_name, expand_urls
+
+
+@dataclass
+class VerifyReport:
+    """What was looked at, and what is wrong with it."""
+
+    shards: int = 0
+    photos: int = 0  # those that decode
+    bytes: int = 0  # of the shards
+    problems: list[Problem] = field(default_factory=list)
+
+
+def verify(
+    urls: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    on_problem: Callable[[Problem], None] | None = None,
+    *,
+    shortest_side_px: int = 1,
+    progress: bool | None = None,
+) -> VerifyReport:
+    """Reads all of a source: the headers of its shards, and each photo down to its pixels. Nothing is written.
+
+    A shard that cannot be read, or holds no photo at all, is a problem of that shard; the others are still looked at.
+
+    Args:
+        urls: as `expand_urls` takes them.
+        on_problem: gets each problem as it is found.
+        shortest_side_px: a photo with a shorter side is a problem.
+        progress: show a progress bar; by default where stderr is a terminal.
+
+    Raises:
+        ValueError, FileNotFoundError: as `expand_urls` raises them.
+        ImportError: a package that a remote url needs is missing.
+    """
+    shard_urls = expand_urls(urls)
+    report = VerifyReport()
+
+    def add(problem: Problem) -> None:
+        report.problems.append(problem)
+        if on_problem is not None:
+            on_problem(problem)
+
+    with tqdm(desc="verifying", unit="photo", disable=None if progress is None else not progress) as bar:
+        for number, url in enumerate(shard_urls, start=1):
+            bar.set_postfix_str(f"shard {number} of {len(shard_urls)}: {base_name(url)}")
+            before = report.photos + len(report.problems)
+            try:
+                with ShardFile(url) as file:
+                    report.bytes += file.size
+                    for key, offset, size in photo_members(file, add):
+                        reason = _reason_against(file.read_at(offset, size), shortest_side_px)
+                        if reason is None:
+                            report.photos += 1
+                        else:
+                            add(Problem(url, key, offset, reason))
+                        bar.update()
+            except OSError as error:
+                add(Problem(url, None, 0, f"cannot be read: {error.strerror or error}"))
+            if report.photos + len(report.problems) == before:
+                add(Problem(url, None, 0, "no JPEG, PNG or WebP in it"))
+            report.shards += 1
+    return report
+
+
+def _reason_against(data: bytes, shortest_side_px: int) -> str | None:
+    """Why this photo cannot be used; None where it can."""
+    try:
+        height, width, _ = decode_rgb(data).shape
+    except BadPhoto as fault:
+        return fault.reason
+    if min(height, width) < shortest_side_px:
+        return f"too small: {width} x {height} pixels, a side has at least {shortest_side_px}"
+    return None
