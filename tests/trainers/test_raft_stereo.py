@@ -52,6 +52,25 @@ def test_alt_gives_the_numbers_and_the_gradients_of_reg():
         torch.testing.assert_close(alt, reg, atol=1e-5, rtol=1e-5)
 
 
+def test_alt_keeps_no_more_than_the_features_for_the_backward_pass():
+    features = torch.randn(2, 1, 16, 4, 64).unbind()
+    kept = {}
+    with torch.autograd.graph.saved_tensors_hooks(lambda tensor: kept.setdefault(tensor.data_ptr(), tensor), lambda tensor: tensor):
+        left, right = (feature.requires_grad_() for feature in features)
+        lookup = correlation_on_demand(left, right, levels=3, radius=4)
+        for _ in range(4):
+            lookup(torch.zeros(1, 1, 4, 64)).sum()
+    assert sum(tensor.numel() for tensor in kept.values()) < 4 * left.numel()
+
+
+def test_no_gradient_flows_from_one_iteration_to_the_next_through_the_disparity():
+    matcher = load_matcher("raft_stereo", **SMALL)
+    seen = []
+    matcher.update_block.encoder.register_forward_pre_hook(lambda _, args: seen.append(args[0].requires_grad))
+    matcher(*small_pair(size=(64, 64)), iterations=3)
+    assert seen == [False] * 3
+
+
 def test_the_whole_matcher_gives_the_same_with_alt():
     matchers = [load_matcher("raft_stereo", corr_implementation=name, **SMALL).eval() for name in ("reg", "alt")]
     matchers[1].load_state_dict(matchers[0].state_dict())
