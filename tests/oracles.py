@@ -18,7 +18,7 @@ def surfaces(disparity: np.ndarray) -> list[tuple[int, int]]:
 
 
 def disparity_at(disparity: np.ndarray, run: tuple[int, int], u: int) -> float | None:
-    """The disparity of one surface where it covers the centre of right column u (its nearest point, where it is seen edge-on), else None."""
+    """The disparity of one surface where it covers right column u (its nearest point, where it is seen edge-on), else None."""
     first, last = run
     landing = {x: x - disparity[x] for x in range(first, last + 1)}
     found = []

@@ -19,7 +19,9 @@ def photo(seed: int, height: int = 120, width: int = 160) -> np.ndarray:
     generator = np.random.default_rng(seed)
     coarse = generator.integers(0, 256, (6, 8, 3)).astype(np.float32)
     fine = generator.normal(0, 12, (height, width, 3))
-    return np.clip(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC) + cv2.GaussianBlur(fine, (0, 0), 1.2) * 3, 0, 255).astype(np.uint8)
+    return np.clip(
+        cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC) + cv2.GaussianBlur(fine, (0, 0), 1.2) * 3, 0, 255
+    ).astype(np.uint8)
 
 
 def jpeg(image: np.ndarray) -> bytes:

@@ -187,7 +187,7 @@ def odd_photos():
     rgb = Image.fromarray(photo(3))
     exif = Image.Exif()
     exif[0x0112] = 6
-    sixteen = (np.asarray(rgb.convert("L")).astype(np.uint16) * 257)
+    sixteen = np.asarray(rgb.convert("L")).astype(np.uint16) * 257
     palette = rgb.convert("RGBA")
     palette.putalpha(Image.fromarray((np.indices((120, 160))[1] % 256).astype(np.uint8)))
     return {

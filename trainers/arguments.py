@@ -21,7 +21,7 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         required=True,
         metavar="URL",
-        help='tars of photos: paths, urls or patterns ("shards/{000..099}.tar"); or NAME=URL@WEIGHT for weighted sources (indoor=in.tar@0.7)',
+        help='tars: paths, urls or patterns ("shards/{000..099}.tar"); or NAME=URL@WEIGHT for weighted sources (indoor=in.tar@0.7)',
     )
     stream.add_argument(
         "--sources-from",
@@ -32,33 +32,64 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
         help="other sources from that epoch on; may be given several times",
     )
     stream.add_argument("--epoch-size", type=int, metavar="N", help="samples per epoch (default: one pass over the photos)")
-    stream.add_argument("--size", type=int, nargs=2, default=(384, 512), metavar=("HEIGHT", "WIDTH"), help="of the crops, multiples of 32 (default: 384 512)")
+    stream.add_argument(
+        "--size",
+        type=int,
+        nargs=2,
+        default=(384, 512),
+        metavar=("HEIGHT", "WIDTH"),
+        help="of the crops, multiples of 32 (default: 384 512)",
+    )
     stream.add_argument("--depth", default="builtin", help='"builtin", or a Hub id or folder in the transformers format (default: builtin)')
-    stream.add_argument("--inpaint", default="builtin", help='"builtin", "background", or a Hub id or folder in the diffusers format (default: builtin)')
-    stream.add_argument("--disparity", choices=("adaptive", "uniform"), default="adaptive", help="the paper's ADS, or MfS-Stereo's uniform range")
+    stream.add_argument(
+        "--inpaint", default="builtin", help='"builtin", "background", or a Hub id or folder in the diffusers format (default: builtin)'
+    )
+    stream.add_argument(
+        "--disparity", choices=("adaptive", "uniform"), default="adaptive", help="the paper's ADS, or MfS-Stereo's uniform range"
+    )
     stream.add_argument("--no-confidence", action="store_true", help="every label counts fully (no TCG)")
     stream.add_argument("--no-augmentation", action="store_true", help="train on the clean pairs")
     stream.add_argument("--seed", type=int, default=0, help="of the stream and of the fresh weights (default: 0)")
-    stream.add_argument("--workers", type=int, default=defaults.workers, help=f"processes that make pairs, per rank (default: {defaults.workers})")
+    stream.add_argument(
+        "--workers", type=int, default=defaults.workers, help=f"processes that make pairs, per rank (default: {defaults.workers})"
+    )
 
     training = parser.add_argument_group("the training")
     training.add_argument("--steps", type=int, default=defaults.steps, help=f"optimizer steps in all (default: {defaults.steps:,})")
-    training.add_argument("--batch-size", type=int, default=defaults.batch_size, help=f"pairs per rank and step (default: {defaults.batch_size})")
+    training.add_argument(
+        "--batch-size", type=int, default=defaults.batch_size, help=f"pairs per rank and step (default: {defaults.batch_size})"
+    )
     training.add_argument("--accumulate", type=int, default=1, help="batches per optimizer step (default: 1)")
-    training.add_argument("--iterations", type=int, default=defaults.iterations, help=f"of the matcher, in training (default: {defaults.iterations})")
-    training.add_argument("--learning-rate", type=float, default=defaults.learning_rate, help=f"peak of the one-cycle (default: {defaults.learning_rate})")
+    training.add_argument(
+        "--iterations", type=int, default=defaults.iterations, help=f"of the matcher, in training (default: {defaults.iterations})"
+    )
+    training.add_argument(
+        "--learning-rate", type=float, default=defaults.learning_rate, help=f"peak of the one-cycle (default: {defaults.learning_rate})"
+    )
     training.add_argument("--mixed-precision", choices=("no", "bf16", "fp16"), help="default: what `accelerate launch` was told")
-    training.add_argument("--initial-weights", type=Path, metavar="FILE", help="a published or own checkpoint to start from (.pth or .safetensors)")
+    training.add_argument(
+        "--initial-weights", type=Path, metavar="FILE", help="a published or own checkpoint to start from (.pth or .safetensors)"
+    )
     training.add_argument("--output", type=Path, required=True, metavar="DIR", help="the run's folder: checkpoints, logs, evaluation.json")
-    training.add_argument("--resume", type=Path, metavar="DIR", help="go on from the newest checkpoint of that run, or from that checkpoint")
-    training.add_argument("--save-every", type=int, default=defaults.save_every, help=f"steps between checkpoints (default: {defaults.save_every:,})")
+    training.add_argument(
+        "--resume", type=Path, metavar="DIR", help="go on from the newest checkpoint of that run, or from that checkpoint"
+    )
+    training.add_argument(
+        "--save-every", type=int, default=defaults.save_every, help=f"steps between checkpoints (default: {defaults.save_every:,})"
+    )
     training.add_argument("--tracker", default="tensorboard", help='one of Accelerate\'s trackers, or "none" (default: tensorboard)')
 
     evaluation = parser.add_argument_group("the evaluation at the end")
     evaluation.add_argument(
-        "--evaluate", nargs="+", default=[], metavar="WHAT", help='"motorcycle" (ships with scikit-image), or folders of stereo pairs with ground truth'
+        "--evaluate",
+        nargs="+",
+        default=[],
+        metavar="WHAT",
+        help='"motorcycle" (ships with scikit-image), or folders of stereo pairs with ground truth',
     )
-    evaluation.add_argument("--evaluation-iterations", type=int, default=defaults.evaluation_iterations, help=f"default: {defaults.evaluation_iterations}")
+    evaluation.add_argument(
+        "--evaluation-iterations", type=int, default=defaults.evaluation_iterations, help=f"default: {defaults.evaluation_iterations}"
+    )
 
 
 def open_stream(arguments: argparse.Namespace) -> ZeroStereoStream:
@@ -83,7 +114,18 @@ def open_stream(arguments: argparse.Namespace) -> ZeroStereoStream:
 
 def train_config(arguments: argparse.Namespace) -> TrainConfig:
     """How to train, as the arguments say."""
-    names = ("steps", "batch_size", "iterations", "evaluation_iterations", "learning_rate", "accumulate", "workers", "mixed_precision", "save_every", "seed")
+    names = (
+        "steps",
+        "batch_size",
+        "iterations",
+        "evaluation_iterations",
+        "learning_rate",
+        "accumulate",
+        "workers",
+        "mixed_precision",
+        "save_every",
+        "seed",
+    )
     return TrainConfig(**{name: getattr(arguments, name) for name in names})
 
 

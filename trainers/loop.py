@@ -148,7 +148,9 @@ def train(
                 loss, metrics = loss_function(initial, sequence, batch)
                 if not math.isfinite(loss.item()):
                     ids = [(meta["epoch"], meta["index"], meta["key"]) for meta in batch.meta]
-                    raise RuntimeError(f"the loss is {loss.item()} at step {step}; samples (epoch, index, key): {ids}. stream.replay shows them")
+                    raise RuntimeError(
+                        f"the loss is {loss.item()} at step {step}; samples (epoch, index, key): {ids}. stream.replay shows them"
+                    )
                 accelerator.backward(loss)
                 if accelerator.sync_gradients:
                     accelerator.clip_grad_norm_(model.parameters(), config.clip_norm)
@@ -160,7 +162,11 @@ def train(
             step += 1
             progress.update()
             if step % LOG_EVERY_STEPS == 0 or step == config.steps:
-                values = {"loss": loss.item(), **{name: float(value) for name, value in metrics.items()}, "learning_rate": schedule.get_last_lr()[0]}
+                values = {
+                    "loss": loss.item(),
+                    **{name: float(value) for name, value in metrics.items()},
+                    "learning_rate": schedule.get_last_lr()[0],
+                }
                 pairs_seen = (step - mark.step) * config.batch_size * config.accumulate * accelerator.num_processes
                 wait = loader.stats()["seconds"].get("wait", 0.0)
                 values |= mark.rates(pairs_seen, wait)

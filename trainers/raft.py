@@ -1,7 +1,7 @@
 """Trains RAFT-Stereo on pairs that are made while it trains.
 
-    accelerate launch trainers/raft.py --sources photos.tar --output runs/first
-    accelerate launch trainers/raft.py --sources photos.tar --output runs/first --resume runs/first
+accelerate launch trainers/raft.py --sources photos.tar --output runs/first
+accelerate launch trainers/raft.py --sources photos.tar --output runs/first --resume runs/first
 """
 
 from __future__ import annotations
@@ -29,7 +29,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_training_arguments(parser)
     model = parser.add_argument_group("RAFT-Stereo (defaults as published)")
-    model.add_argument("--hidden-dims", type=int, nargs=3, default=(128, 128, 128), help="channels of the GRUs, coarsest first (default: 128 128 128)")
+    model.add_argument(
+        "--hidden-dims", type=int, nargs=3, default=(128, 128, 128), help="channels of the GRUs, coarsest first (default: 128 128 128)"
+    )
     model.add_argument("--corr-implementation", choices=("reg", "alt"), default="reg", help="alt saves memory, same numbers (default: reg)")
     model.add_argument("--corr-levels", type=int, default=4, help="levels of the correlation pyramid (default: 4)")
     model.add_argument("--corr-radius", type=int, default=4, help="of the lookup (default: 4)")
@@ -39,7 +41,16 @@ def main() -> None:
     model.add_argument("--shared-backbone", action="store_true", help="one encoder for features and context")
     arguments = parser.parse_args()
 
-    names = ("hidden_dims", "corr_implementation", "corr_levels", "corr_radius", "n_downsample", "n_gru_layers", "slow_fast_gru", "shared_backbone")
+    names = (
+        "hidden_dims",
+        "corr_implementation",
+        "corr_levels",
+        "corr_radius",
+        "n_downsample",
+        "n_gru_layers",
+        "slow_fast_gru",
+        "shared_backbone",
+    )
     options = {name: getattr(arguments, name) for name in names}
     torch.manual_seed(arguments.seed)  # the fresh weights
     matcher = load_matcher("raft_stereo", **options)

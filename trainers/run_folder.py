@@ -1,9 +1,9 @@
 """The folder of a training run: whole checkpoints, written beside and renamed, and the newest of them found again.
 
-    OUTPUT/checkpoints/step-00000500/model.safetensors    weights under their published names
-                                     config.json          which matcher with which options: what `evaluate.py` needs
-                                     training.pt          optimizer, schedule and gradient scaler (tensors and numbers only)
-                                     state.json           step, place in the stream, the run's arguments
+OUTPUT/checkpoints/step-00000500/model.safetensors    weights under their published names
+                                 config.json          which matcher with which options: what `evaluate.py` needs
+                                 training.pt          optimizer, schedule and gradient scaler (tensors and numbers only)
+                                 state.json           step, place in the stream, the run's arguments
 """
 
 from __future__ import annotations
@@ -52,7 +52,9 @@ def newest(path: Path) -> Path:
         return path
     checkpoints = _whole(path)
     if not checkpoints:
-        raise FileNotFoundError(f"no checkpoint to resume from in {path}; give --resume the --output folder of a run or one of its checkpoints")
+        raise FileNotFoundError(
+            f"no checkpoint to resume from in {path}; give --resume the --output folder of a run or one of its checkpoints"
+        )
     return checkpoints[-1]
 
 

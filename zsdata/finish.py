@@ -29,7 +29,14 @@ class Finisher:
         with meter.stage("transfer"):
             left, right, disparity, confidence, nonocclusion, inpaint = (
                 tensor.to(self.device, non_blocking=True)
-                for tensor in (prepared.left, prepared.right, prepared.disparity, prepared.confidence, prepared.nonocclusion, prepared.inpaint)
+                for tensor in (
+                    prepared.left,
+                    prepared.right,
+                    prepared.disparity,
+                    prepared.confidence,
+                    prepared.nonocclusion,
+                    prepared.inpaint,
+                )
             )
             context = {name: tensor.to(self.device, non_blocking=True).float() for name, tensor in prepared.context.items()}
         left_clean = left.float()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -27,8 +26,8 @@ class StereoLoader:
 
     `iter(loader)` gives what is left of the current epoch and moves on to the next one at its end; a broken-off loop is continued where it
     stopped. Global batch g of an epoch holds its samples [g R B, (g + 1) R B) for R ranks of batch B, so every rank sees the same number of
-    batches and no sample is given twice. It is no torch DataLoader: `Accelerator.prepare` leaves it alone, and it tells Accelerate itself when an
-    epoch ends, as gradient accumulation needs to know.
+    batches and no sample is given twice. It is no torch DataLoader: `Accelerator.prepare` leaves it alone, and it tells Accelerate itself
+    when an epoch ends, as gradient accumulation needs to know.
 
     Not made for two loops at once: one loader has one place.
     """
@@ -95,9 +94,8 @@ class StereoLoader:
         self.end_of_dataloader = False
         try:
             while self._left(epoch, self._samples) > 0:
-                start = time.perf_counter()
-                prepared = self._next_prepared()
-                self._meter.seconds["wait"] += time.perf_counter() - start
+                with self._meter.stage("wait"):
+                    prepared = self._next_prepared()
                 batch = self._finisher(prepared, self._meter)
                 self._batches += 1
                 self._samples += self._global_batch
@@ -136,9 +134,9 @@ class StereoLoader:
     def stats(self) -> dict[str, Any]:
         """What this rank has seen so far.
 
-        `batches`, `pairs`; `rejected`: photos refused, by reason; `examples`: (source, shard, key, reason) of the first ones; `shard_problems`: faults of
-        the shards themselves, by reason; `seconds`: time by stage, those of the workers added up over all of them, "wait" being how long
-        the training process stood still for lack of a prepared batch.
+        `batches`, `pairs`; `rejected`: photos refused, by reason; `examples`: (source, shard, key, reason) of the first ones;
+        `shard_problems`: faults of the shards themselves, by reason; `seconds`: time by stage, those of the workers added up over all of
+        them, "wait" being how long the training process stood still for lack of a prepared batch.
         """
         return {
             "batches": self._batches,
@@ -188,7 +186,7 @@ class StereoLoader:
         expected = self._indices(self._samples)
         if [(meta["epoch"], meta["index"]) for meta in prepared.meta] != [(self._epoch, index) for index in expected]:
             raise RuntimeError(f"expected samples {expected} of epoch {self._epoch}, got {prepared.meta}")
-        self._meter.seconds.update(prepared.seconds)
+        self._meter.add(prepared.seconds)
         self._faults.add(len(prepared.meta), prepared.rejected)
         return prepared
 
@@ -261,4 +259,3 @@ def _use_one_thread(worker_id: int) -> None:
     del worker_id
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-

@@ -34,7 +34,9 @@ class Position:
             raise ValueError(f"a stream's state is a dictionary as state_dict() returns it; got {type(state).__name__}")
         names = {"version", *(field.name for field in fields(Position))}
         if state.keys() != names:
-            raise ValueError(f"not a stream's state: missing {sorted(names - state.keys())}, unknown {sorted(map(str, state.keys() - names))}")
+            raise ValueError(
+                f"not a stream's state: missing {sorted(names - state.keys())}, unknown {sorted(map(str, state.keys() - names))}"
+            )
         if state["version"] != VERSION:
             raise ValueError(f"the state's version is {state['version']!r}; this zsdata reads version {VERSION}")
         for name in ("epoch", "samples"):

@@ -38,16 +38,16 @@ class ZeroStereoStream(IterableDataset):
     """An endless, reproducible stream of stereo pairs made from single photos (ZeroStereo, ICCV 2025).
 
     Sample i of epoch e is a function of (seed, e, i), the photos and these arguments, and of nothing else: not of the number of workers or
-    ranks, the batch size, or what was drawn before. Iterating the stream itself gives the finished pairs of one epoch on the CPU, and of the
-    next one when iterated again; `loader` gives finished batches on a device, made ahead by worker processes.
+    ranks, the batch size, or what was drawn before. Iterating the stream itself gives the finished pairs of one epoch on the CPU, and of
+    the next one when iterated again; `loader` gives finished batches on a device, made ahead by worker processes.
 
-    Inside a torch DataLoader with workers each worker makes its share of the samples. There, torch copies the stream to new workers for every
-    epoch, so say which epoch it is: `stream.set_epoch(epoch)`; with `persistent_workers=True` the workers count for themselves.
+    Inside a torch DataLoader with workers each worker makes its share of the samples. There, torch copies the stream to new workers for
+    every epoch, so say which epoch it is: `stream.set_epoch(epoch)`; with `persistent_workers=True` the workers count for themselves.
 
     Args:
         sources: tars of photos: a path, url or pattern ("shards/{000..099}.tar"), a list of such, named and weighted sources
-            ({"indoor": ImageSource("in.tar", weight=0.7), "street": ImageSource("out.tar", weight=0.3)}), or any of these by the epoch from which
-            they are used ({0: "first.tar", 5: "second.tar"}).
+            ({"indoor": ImageSource("in.tar", weight=0.7), "street": ImageSource("out.tar", weight=0.3)}), or any of these by the epoch
+            from which they are used ({0: "first.tar", 5: "second.tar"}).
         size: (height, width) of the pairs, in pixels.
         depth: "builtin", a Hub id or folder in the transformers format, or a callable (see `load_depth`).
         inpaint: "builtin", "background", a Hub id or folder in the diffusers format, or a callable (see `load_inpainter`).
@@ -88,7 +88,9 @@ class ZeroStereoStream(IterableDataset):
             first = self._schedule.problems[0]
             logger.warning(
                 "%d faults in the shards (%s), the first: %s; `zsdata verify` lists them",
-                self._problems.total(), ", ".join(f"{reason}: {count}" for reason, count in self._problems.most_common()), first,
+                self._problems.total(),
+                ", ".join(f"{reason}: {count}" for reason, count in self._problems.most_common()),
+                first,
             )
         self._inpaint = inpaint if callable(inpaint) else os.fspath(inpaint)
         self._augmentation = augmentation if augmentation is not None else AugmentConfig()
@@ -218,7 +220,7 @@ class ZeroStereoStream(IterableDataset):
 
     def _make(self, epoch: int, index: int) -> StereoBatch:
         prepared = self._worker.prepare(epoch, index)
-        self._meter.seconds.update(prepared.seconds)
+        self._meter.add(prepared.seconds)
         self._faults.add(1, prepared.rejected)
         return self._finish(prepared)
 

@@ -46,7 +46,8 @@ class Prepared:
     """A pair before inpainting, as it crosses the process border: images uint8, masks bool.
 
     One sample has no batch axis and one `meta`; `stack` makes a batch of them. `right` is 0 in its holes; `right_disparity` and
-    `background` are there where the inpainter needs them. `rejected` lists (source, shard, key, reason) of the photos that could not be used.
+    `background` are there where the inpainter needs them. `rejected` lists (source, shard, key, reason) of the photos that could not be
+    used.
     """
 
     left: Tensor
@@ -67,15 +68,15 @@ class Prepared:
             name: torch.stack([getattr(sample, name) for sample in samples])
             for name in ("left", "right", "disparity", "confidence", "nonocclusion", "inpaint")
         }
-        seconds = Meter()
+        meter = Meter()
         for sample in samples:
-            seconds.seconds.update(sample.seconds)
+            meter.add(sample.seconds)
         return Prepared(
             **tensors,
             context={name: torch.stack([sample.context[name] for sample in samples]) for name in samples[0].context},
             meta=[sample.meta for sample in samples],
             rejected=[reject for sample in samples for reject in sample.rejected],
-            seconds=dict(seconds.seconds),
+            seconds=meter.seconds,
         )
 
     def pin_memory(self) -> Prepared:
@@ -119,9 +120,7 @@ class Worker:
             f"the last ones: {last}. `zsdata verify` lists what is wrong with its shards."
         )
 
-    def _pair(
-        self, sources: SourceSet, choice: Choice, epoch: int, index: int, rejected: list[tuple[str, str, str, str]]
-    ) -> Prepared:
+    def _pair(self, sources: SourceSet, choice: Choice, epoch: int, index: int, rejected: list[tuple[str, str, str, str]]) -> Prepared:
         recipe, meter = self._recipe, Meter()
         manifest = sources.manifests[choice.source]
         with meter.stage("read"):
@@ -148,7 +147,9 @@ class Worker:
             context["right_disparity"] = warped.right_disparity[0].contiguous()
         if "background" in recipe.inpainter_needs:
             with meter.stage("background"):
-                context["background"] = torch.from_numpy(self._background(sources, choice, epoch, index, photo)).permute(2, 0, 1).contiguous()
+                context["background"] = (
+                    torch.from_numpy(self._background(sources, choice, epoch, index, photo)).permute(2, 0, 1).contiguous()
+                )
         member = manifest.member(choice.member)
         meta = {
             "seed": recipe.seed,
@@ -175,7 +176,7 @@ class Worker:
             context=context,
             meta=meta,
             rejected=rejected,
-            seconds=dict(meter.seconds),
+            seconds=meter.seconds,
         )
 
     def _background(self, sources: SourceSet, choice: Choice, epoch: int, index: int, photo: np.ndarray) -> np.ndarray:

@@ -3,8 +3,8 @@ import warnings
 import pytest
 import torch
 
-from zsdata import ZeroStereoStream, load_depth
 from tests.scenes import grey_fill, photo_tar
+from zsdata import ZeroStereoStream, load_depth
 
 transformers = pytest.importorskip("transformers")
 
@@ -17,7 +17,12 @@ def folder(tmp_path_factory):
         out_features=["stage1", "stage2", "stage3", "stage4"], reshape_hidden_states=False,
     )  # fmt: skip
     config = transformers.DepthAnythingConfig(
-        backbone_config=backbone, reassemble_hidden_size=32, neck_hidden_sizes=[8, 16, 24, 32], fusion_hidden_size=16, head_hidden_size=8, patch_size=14
+        backbone_config=backbone,
+        reassemble_hidden_size=32,
+        neck_hidden_sizes=[8, 16, 24, 32],
+        fusion_hidden_size=16,
+        head_hidden_size=8,
+        patch_size=14,
     )
     path = tmp_path_factory.mktemp("depth_anything")
     torch.manual_seed(0)

@@ -28,7 +28,7 @@ class AdaptiveDisparity:
     def __post_init__(self) -> None:
         if not (self.radius > 0 and self.center - 2 * self.radius >= 0 and self.center + 2 * self.radius <= 1):
             raise ValueError(
-                f"center - 2 radius .. center + 2 radius is a range of shares of the width, within 0..1; got {self.center} and {self.radius}"
+                f"center - 2 radius .. center + 2 radius are shares of the width, within 0..1; got {self.center} and {self.radius}"
             )
         probabilities = (self.center_probability, self.small_probability, self.large_probability)
         if min(probabilities) < 0 or abs(sum(probabilities) - 1) > 1e-6:
@@ -92,9 +92,9 @@ def _neighbour_slices():
 def sharpen_disparity(disparity: Tensor, edge_px: float = SHARPEN_EDGE_PX) -> Tensor:
     """Replaces every edge value by the nearest value that is none, so that a depth edge is a step and no pixel hangs between two surfaces.
 
-    An edge is where the Sobel magnitude (root mean square of both directions, kernels 1-2-1 over 4) exceeds `edge_px`. The nearest is that of the
-    smallest Euclidean distance; of several at one distance the one in the nearest row wins, then the row above, then the left one. A map that
-    is edge all over stays as it is.
+    An edge is where the Sobel magnitude (root mean square of both directions, kernels 1-2-1 over 4) exceeds `edge_px`. The nearest is
+    that of the smallest Euclidean distance; of several at one distance the one in the nearest row wins, then the row above, then the left
+    one. A map that is edge all over stays as it is.
 
     Args:
         disparity: float32 [B, 1, H, W], pixels.

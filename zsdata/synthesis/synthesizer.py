@@ -65,7 +65,9 @@ def estimate_depth(depth: DepthEstimator, photos: Tensor, config: SynthesisConfi
     return DepthMaps(inverse_depth, confidence, flip_consistency(inverse_depth, mirrored))
 
 
-def synthesize(photo_view: Tensor, depth: DepthMaps, view: View, photo_size: tuple[int, int], scale: float, config: SynthesisConfig) -> Synthesized:
+def synthesize(
+    photo_view: Tensor, depth: DepthMaps, view: View, photo_size: tuple[int, int], scale: float, config: SynthesisConfig
+) -> Synthesized:
     """The right view of one photo's view, with holes, and both masks.
 
     Args:

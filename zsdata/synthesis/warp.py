@@ -6,8 +6,8 @@ torn. Right pixel u shows the nearest surface that covers its centre, at the ver
 covers it, u is a hole.
 
 Two facts make this one scatter per row. Among the sources that land on one u, the one with the larger x is the nearer, because
-d = x - u; so the z-buffer is `amax` of the source's position. And with d = n + f (n whole, 0 <= f < 1; both exact in floating point) the first
-column at or right of x' is x - n, so that every comparison is between disparities, never between rounded positions.
+d = x - u; so the z-buffer is `amax` of the source's position. And with d = n + f (n whole, 0 <= f < 1; both exact in floating point) the
+first column at or right of x' is x - n, so that every comparison is between disparities, never between rounded positions.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ class Warped(NamedTuple):
 def forward_warp(left: Tensor, disparity: Tensor) -> Warped:
     """Moves each pixel of `left` by its disparity; the nearest one wins (paper, section "Overview": the warped image and both masks).
 
-    Colours are resampled along the row by cubic convolution (Catmull-Rom) at the point of the surface that lands on the pixel's centre, with
-    taps from that surface alone, so that nothing bleeds across a depth edge. Every pixel of the result depends on its own row only, and
-    no sum depends on the batch: a sample's result is the same bit for bit in any batch. Differentiable in `left`; not in `disparity`.
+    Colours are resampled along the row by cubic convolution (Catmull-Rom) at the point of the surface that lands on the pixel's centre,
+    with taps from that surface alone, so that nothing bleeds across a depth edge. Every pixel of the result depends on its own row only,
+    and no sum depends on the batch: a sample's result is the same bit for bit in any batch. Differentiable in `left`; not in `disparity`.
 
     Args:
         left: float [B, C, H, W]; RGB 0..255 in the stream, any C and range here (the result is kept within the range of each image).
@@ -52,7 +52,7 @@ def forward_warp(left: Tensor, disparity: Tensor) -> Warped:
     """
     if left.ndim != 4 or disparity.ndim != 4 or disparity.shape != (left.shape[0], 1, *left.shape[2:]):
         raise ValueError(
-            f"forward_warp takes left [B, C, H, W] and disparity [B, 1, H, W] of one size; got {list(left.shape)} and {list(disparity.shape)}"
+            f"it takes left [B, C, H, W] and disparity [B, 1, H, W] of one size, got {list(left.shape)} and {list(disparity.shape)}"
         )
     batch, _, height, width = left.shape
     rows = disparity.detach().float().reshape(batch * height, width)

@@ -1,7 +1,7 @@
 """Depth estimators: from a name to a callable.
 
-A depth estimator is anything that maps images, float32 [B, 3, H, W] RGB 0..255, to inverse depth, float32 [B, 1, H, W], larger is nearer, in
-any scale and offset. It is normalised per photo afterwards.
+A depth estimator is anything that maps images, float32 [B, 3, H, W] RGB 0..255, to inverse depth, float32 [B, 1, H, W], larger is nearer,
+in any scale and offset. It is normalised per photo afterwards.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ class PretrainedDepth:
     def __init__(self, name: str, device: str | torch.device = "cpu") -> None:
         try:
             from transformers import AutoModelForDepthEstimation
-            from transformers.utils import cached_file
+            from transformers.utils.hub import cached_file
         except ImportError as error:
             raise ImportError(f'depth="{name}" needs transformers: pip install "zsdata[depth]"') from error
         self._network = AutoModelForDepthEstimation.from_pretrained(name).to(device).eval().requires_grad_(False)
