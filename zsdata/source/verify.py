@@ -83,5 +83,5 @@ def _reason_against(data: bytes, shortest_side_px: int) -> str | None:
     except BadPhoto as fault:
         return fault.reason
     if min(height, width) < shortest_side_px:
-        return f"too small: {width} x {height} pixels, a side has at least {shortest_side_px}"
+        return f"too small: a side shorter than {shortest_side_px} px: {width}x{height}"
     return None

@@ -1,0 +1,275 @@
+"""The `zsdata` command: it parses, calls the library and prints."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+import sys
+from collections import Counter
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+import zsdata
+from zsdata.augment import AugmentConfig
+from zsdata.example_photos import EXAMPLE_PHOTOS, pack_example_photos
+from zsdata.faults import BadShard
+from zsdata.preview import contact_sheet
+from zsdata.sample import StereoBatch
+from zsdata.source.archive import Problem
+from zsdata.source.pack import PackReport, pack
+from zsdata.source.verify import verify
+from zsdata.stream import ZeroStereoStream
+from zsdata.synthesis.depth import load_depth
+from zsdata.synthesis.inpaint import load_inpainter
+from zsdata.worker import SHORTEST_SIDE_PX
+
+OK, FOUND_PROBLEMS, USER_ERROR, INTERRUPTED, PIPE_CLOSED = 0, 1, 2, 130, 141  # the last two as a shell counts signals
+SKIPPED_SHOWN = 20
+
+_URLS = (
+    'a tar, a folder of tars, a pattern in quotes ("shards/{000..099}.tar", "shards/*.tar") or a url '
+    "(http, https, s3, gs, hf); several may be given"
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one command; returns its exit status: 0 done, 1 verify found problems, 2 an error that the user can mend, 130 interrupted."""
+    options = _parser().parse_args(arguments)
+    try:
+        status = options.run(options)
+        sys.stdout.flush()
+        return status
+    except KeyboardInterrupt:
+        return _fail("interrupted", INTERRUPTED)
+    except BrokenPipeError:  # whoever read the output, such as `head`, has enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return PIPE_CLOSED
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename and error.strerror else ""
+        return _fail(where + (error.strerror or str(error)), USER_ERROR)
+    except (ValueError, ImportError, BadShard) as error:
+        return _fail(str(error), USER_ERROR)
+    except RuntimeError as error:
+        if error.__cause__ is not None:  # something broke inside: its traceback is needed
+            raise
+        return _fail(str(error), USER_ERROR)  # the stream gave up: too many photos cannot be used
+
+
+def _fail(message: str, status: int) -> int:
+    print(f"zsdata: {_printable(message)}", file=sys.stderr)
+    return status
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="zsdata",
+        description="Single photographs in, stereo training pairs out. "
+        "First pack photos into shards, then look at the pairs made from them.",
+        epilog="`zsdata COMMAND --help` explains a command. To train, give the shards to zsdata.ZeroStereoStream in Python.",
+    )
+    parser.add_argument("--version", action="version", version=f"zsdata {zsdata.__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+
+    def add(run: Callable[[argparse.Namespace], int], name: str, summary: str, description: str, example: str) -> argparse.ArgumentParser:
+        command = commands.add_parser(name, help=summary, description=description, epilog=f"Example: {example}")
+        command.set_defaults(run=run)
+        return command
+
+    command = add(
+        _pack,
+        "pack",
+        "pack a folder of photos into shards",
+        "Packs the JPEG, PNG and WebP photos in FOLDER and its subfolders into uncompressed tars (shards) in OUTPUT. "
+        "Photos are copied byte for byte; those that zsdata cannot use are left out and listed with the reason. "
+        "FOLDER itself stays as it is.",
+        example="zsdata pack holiday-photos shards",
+    )
+    command.add_argument("folder", metavar="FOLDER", help="folder of photos")
+    command.add_argument("output", metavar="OUTPUT", help="folder for the shards; made if missing")
+    command.add_argument("--photos-per-shard", metavar="N", type=_positive, default=1000, help="photos in each tar (default: %(default)s)")
+    _add_overwrite(command)
+
+    command = add(
+        _example,
+        "example",
+        "pack a few photos to try zsdata with",
+        f"Packs {len(EXAMPLE_PHOTOS)} photos that come with scikit-image into a shard in OUTPUT. "
+        'Nothing is downloaded; scikit-image itself is installed by pip install "zsdata[demo]".',
+        example="zsdata example example-shards",
+    )
+    command.add_argument("output", metavar="OUTPUT", help="folder for the shard; made if missing")
+    _add_overwrite(command)
+
+    command = add(
+        _verify,
+        "verify",
+        "check every photo of a source",
+        "Walks all shards and decodes every photo. Prints a line per problem (shard, photo, reason) and a summary. "
+        "The exit status is 0 when all is well, 1 when there are problems, 2 when nothing could be checked.",
+        example='zsdata verify "shards/{000..099}.tar"',
+    )
+    command.add_argument("urls", metavar="SHARDS", nargs="+", help=_URLS)
+
+    command = add(
+        _preview,
+        "preview",
+        "make a picture of pairs, as training would see them",
+        "Makes pairs and draws them on a contact sheet, one row each: left and right image, disparity, confidence, "
+        "which pixels are hidden in the right image and which were invented there, and where the pair comes from.",
+        example="zsdata preview --sources shards --output preview.png",
+    )
+    command.add_argument("--sources", metavar="SHARDS", nargs="+", required=True, help=_URLS)
+    command.add_argument("--output", metavar="FILE.png", required=True, type=Path, help="the picture; an existing one is replaced")
+    command.add_argument("--pairs", metavar="N", type=_positive, default=6, help="how many (default: %(default)s)")
+    command.add_argument("--epoch", metavar="E", type=_count, default=0, help="of the first pair (default: %(default)s)")
+    command.add_argument("--first-index", metavar="I", type=_count, default=0, help="of the first pair in its epoch (default: %(default)s)")
+    command.add_argument(
+        "--size", metavar=("HEIGHT", "WIDTH"), nargs=2, type=_positive, default=(384, 512), help="of a pair in pixels (default: 384 512)"
+    )
+    command.add_argument(
+        "--depth", metavar="NAME", default="builtin", help='"builtin", or a Hub id or folder in the transformers format (default: builtin)'
+    )
+    command.add_argument(
+        "--inpaint",
+        metavar="NAME",
+        default="builtin",
+        help='"builtin", "background" (another photo), or a Hub id or folder in the diffusers format (default: builtin)',
+    )
+    command.add_argument("--seed", metavar="N", type=_count, default=0, help="of the stream (default: %(default)s)")
+    command.add_argument("--clean", action="store_true", help="show the pairs without their augmentation")
+    return parser
+
+
+def _add_overwrite(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--overwrite", action="store_true", help="replace shards that were packed into OUTPUT before, under the same name")
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number, 0 or more")
+    return int(text)
+
+
+def _positive(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number, 1 or more")
+    return int(text)
+
+
+def _pack(options: argparse.Namespace) -> int:
+    return _pack_and_tell(partial(pack, options.folder, photos_per_shard=options.photos_per_shard), options)
+
+
+def _example(options: argparse.Namespace) -> int:
+    return _pack_and_tell(pack_example_photos, options)
+
+
+def _pack_and_tell(make_shards: Callable[..., PackReport], options: argparse.Namespace) -> int:
+    try:
+        report = make_shards(options.output, overwrite=options.overwrite)
+    except FileExistsError as error:
+        if options.overwrite:
+            raise
+        raise FileExistsError(f"{error} (--overwrite)") from error
+    shards = report.shards[0] if len(report.shards) == 1 else f"{len(report.shards):,} shards, {report.shards[0]} to {report.shards[-1]}"
+    print(f"packed {_several(report.photos, 'photo')} ({_megabytes(report.bytes)}) into {_printable(shards)}")
+    if report.skipped:
+        print(f"skipped {len(report.skipped):,}:")
+        for path, reason in report.skipped[:SKIPPED_SHOWN]:
+            print(f"  {_printable(path)}: {_printable(reason)}")
+        if len(report.skipped) > SKIPPED_SHOWN:
+            print(f"  ... and {len(report.skipped) - SKIPPED_SHOWN:,} more")
+    print(f"to look at pairs made from them: zsdata preview --sources {_printable(shlex.quote(options.output))} --output preview.png")
+    return OK
+
+
+def _verify(options: argparse.Namespace) -> int:
+    report = verify(options.urls, _print_problem, shortest_side_px=SHORTEST_SIDE_PX)
+    good = f"{_several(report.photos, 'good photo')} in {_several(report.shards, 'shard')}, {_megabytes(report.bytes)}"
+    if not report.problems:
+        print(f"all is well: {good}")
+        return OK
+    reasons = Counter(problem.reason.split(":")[0] for problem in report.problems)
+    by_reason = ", ".join(f"{reason}: {count:,}" for reason, count in reasons.most_common())
+    print(f"{_several(len(report.problems), 'problem')} ({_printable(by_reason)}); {good}")
+    return FOUND_PROBLEMS
+
+
+def _print_problem(problem: Problem) -> None:
+    where = f"at byte {problem.offset:,}" if problem.key is None else f'"{problem.key}"'
+    tqdm.write(_printable(f"{problem.shard} {where}: {problem.reason}"), file=sys.stdout)
+
+
+def _preview(options: argparse.Namespace) -> int:
+    output: Path = options.output
+    if output.suffix.lower() != ".png" or output.is_dir():
+        raise ValueError(f"{output}: the preview is a PNG file; give --output a name that ends in .png")
+    if not output.parent.is_dir():
+        raise NotADirectoryError(f"{output.parent} is not a folder; make it first, or write the preview elsewhere")
+    stream = ZeroStereoStream(
+        options.sources,
+        size=tuple(options.size),
+        depth=load_depth(options.depth),
+        inpaint=load_inpainter(options.inpaint),
+        seed=options.seed,
+        augmentation=AugmentConfig.none() if options.clean else None,
+    )
+    pairs = _take(stream, options.epoch, options.first_index, options.pairs)
+    _write_png(output, contact_sheet(pairs))
+    (height, width), last = options.size, pairs[-1].meta
+    print(
+        f"{_printable(str(output))}: {_several(len(pairs), 'pair')}, {height} px high and {width} px wide, seed {options.seed}, "
+        f"from epoch {options.epoch}, index {options.first_index} to epoch {last['epoch']}, index {last['index']}"
+    )
+    refused = stream.stats()["rejected"]
+    if refused:
+        print(f"photos that could not be used and were replaced: {', '.join(f'{reason}: {n:,}' for reason, n in refused.items())}")
+    return OK
+
+
+def _take(stream: ZeroStereoStream, epoch: int, index: int, count: int) -> list[StereoBatch]:
+    """`count` pairs from a place on, over the end of the epoch if need be."""
+    size = stream.epoch_size(epoch)
+    if index >= size:
+        raise ValueError(f"--first-index {index}: epoch {epoch} of these sources has samples 0 to {size - 1}, one per photo")
+    stream.load_state_dict({**stream.state_dict(), "epoch": epoch, "samples": index})
+    pairs: list[StereoBatch] = []
+    with tqdm(total=count, desc="making pairs", unit="pair", disable=None) as bar:
+        while len(pairs) < count:
+            for pair in stream:
+                pairs.append(pair)
+                bar.update()
+                if len(pairs) == count:
+                    break
+    return pairs
+
+
+def _write_png(path: Path, image: np.ndarray) -> None:
+    """Whole or not at all."""
+    data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
+    partial = path.with_name(path.name + ".partial")
+    try:
+        partial.write_bytes(data)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _several(count: int, noun: str) -> str:
+    return f"{count:,} {noun}" + ("" if count == 1 else "s")
+
+
+def _megabytes(count: int) -> str:
+    return f"{count / 1e6:,.1f} MB"
+
+
+def _printable(text: str) -> str:
+    """One line, with what no terminal should be sent (control characters, undecodable bytes of file names) written out."""
+    text = text.replace("\n", " ")
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
