@@ -5,6 +5,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import warnings
 
 import cv2
 import numpy as np
@@ -246,6 +247,20 @@ def test_a_full_disk_leaves_the_old_preview_and_nothing_else(run, tmp_path, monk
     status, _, error = run("preview", "--sources", shard, "--output", sheet, "--pairs", 1, "--size", 64, 64)
     assert status == 2 and in_words(error).endswith(": No space left on device\n")
     assert sheet.read_bytes() == b"old" and sorted(path.name for path in tmp_path.iterdir()) == ["a.tar", "p.png"]
+
+
+@pytest.mark.filterwarnings("always")
+def test_a_warning_is_told_in_words(run, tmp_path, monkeypatch):
+    def depth(images):
+        warnings.warn("only for trying out", stacklevel=1)
+        return layered_depth(images)
+
+    monkeypatch.setattr(cli, "load_depth", lambda name: depth)
+    monkeypatch.setattr(cli, "load_inpainter", lambda name: grey_fill)
+    shard, shown = photo_tar(tmp_path / "a.tar", count=1), warnings.showwarning
+    status, _, error = run("preview", "--sources", shard, "--output", tmp_path / "p.png", "--pairs", 1, "--size", 64, 64)
+    assert status == 0 and set(error.splitlines()) == {"zsdata: only for trying out"}
+    assert warnings.showwarning is shown
 
 
 def test_a_failure_inside_keeps_its_traceback(tmp_path, monkeypatch):

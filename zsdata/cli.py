@@ -6,6 +6,7 @@ import argparse
 import os
 import shlex
 import sys
+import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -42,7 +43,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command; returns its exit status: 0 done, 1 verify found problems, 2 an error that the user can mend, 130 interrupted."""
     options = _parser().parse_args(arguments)
     try:
-        status = options.run(options)
+        with warnings.catch_warnings():
+            warnings.showwarning = _print_warning
+            status = options.run(options)
         sys.stdout.flush()
         return status
     except KeyboardInterrupt:
@@ -64,6 +67,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _fail(message: str, status: int) -> int:
     print(f"zsdata: {_printable(message)}", file=sys.stderr)
     return status
+
+
+def _print_warning(message: Warning | str, *where: object) -> None:
+    """A warning in words, without the line of code that it came from."""
+    tqdm.write(f"zsdata: {_printable(str(message))}", file=sys.stderr)
 
 
 def _parser() -> argparse.ArgumentParser:
