@@ -24,6 +24,7 @@ from zsdata.preview import contact_sheet
 from zsdata.sample import StereoBatch
 from zsdata.source.archive import Problem
 from zsdata.source.pack import PackReport, pack
+from zsdata.source.urls import expand_urls
 from zsdata.source.verify import verify
 from zsdata.stream import ZeroStereoStream
 from zsdata.synthesis.depth import load_depth
@@ -220,8 +221,9 @@ def _preview(options: argparse.Namespace) -> int:
         raise ValueError(f"{output}: the preview is a PNG file; give --output a name that ends in .png")
     if not output.parent.is_dir():
         raise NotADirectoryError(f"{output.parent} is not a folder; make it first, or write the preview elsewhere")
+    shards = expand_urls(options.sources)  # a wrong path is told before a network is loaded
     stream = ZeroStereoStream(
-        options.sources,
+        shards,
         size=tuple(options.size),
         depth=load_depth(options.depth),
         inpaint=load_inpainter(options.inpaint),
