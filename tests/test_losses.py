@@ -26,7 +26,8 @@ def random_case(seed: int, patterns: tuple[str, str, str] = ("random",) * 3, bat
         return torch.from_numpy(values)
 
     masks = Masks(*map(mask, patterns))
-    disparity = torch.from_numpy(rng.uniform(0.1, 6, shape).astype(np.float32))
+    # Whole 64ths, so that single and double precision round x - d to the same column, ties included.
+    disparity = torch.from_numpy(rng.integers(8, 400, shape).astype(np.float32) / 64)
     nothing = torch.from_numpy(rng.choice([np.nan, np.inf, -np.inf], shape).astype(np.float32))
     images = [torch.from_numpy(rng.uniform(0, 255, (batch, 3, *size)).astype(np.float32)) for _ in range(2)]
     predictions = [torch.from_numpy(rng.uniform(-2, 10, shape).astype(np.float32)).requires_grad_() for _ in range(n + 1)]
