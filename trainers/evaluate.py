@@ -159,10 +159,13 @@ def _predictor(arguments: argparse.Namespace, options: dict[str, Any]) -> Predic
     return lambda left, right: matcher.predict(left, right, iterations=arguments.iterations)
 
 
-def _matcher_options() -> dict[str, Any]:
-    """Every option of every matcher, with its default."""
-    signatures = [inspect.signature(matcher).parameters.values() for matcher in MATCHERS.values()]
-    return {parameter.name: parameter.default for parameters in signatures for parameter in parameters}
+def _matcher_options() -> dict[str, dict[str, Any]]:
+    """Every option of every matcher: {option: {model: default}}."""
+    options: dict[str, dict[str, Any]] = {}
+    for model, name in MODELS.items():
+        for parameter in inspect.signature(MATCHERS[name]).parameters.values():
+            options.setdefault(parameter.name, {})[model] = parameter.default
+    return options
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -180,8 +183,9 @@ def _parser() -> argparse.ArgumentParser:
         "--device", default="cuda" if torch.cuda.is_available() else "cpu", help='"cpu", "cuda", "cuda:1" (default: cuda if there is one)'
     )
     group = parser.add_argument_group("the matcher's options, as it was trained (default: as published, or as config.json says)")
-    for name, default in _matcher_options().items():
-        flag, shown = f"--{name.replace('_', '-')}", f"published: {default}"
+    for name, defaults in _matcher_options().items():
+        flag, default = f"--{name.replace('_', '-')}", next(iter(defaults.values()))
+        shown = ", ".join(f"{model}: {published}" for model, published in defaults.items())
         if isinstance(default, bool):
             group.add_argument(flag, dest=name, action=argparse.BooleanOptionalAction, help=shown)
         elif isinstance(default, tuple):
