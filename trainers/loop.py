@@ -16,7 +16,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from trainers import run_folder
-from trainers.evaluate import evaluate
+from trainers.evaluate import evaluate, table
 from trainers.models import Matcher, load_checkpoint
 from trainers.pairs_on_disk import StereoPair
 from zsdata import StereoBatch, ZeroStereoStream
@@ -177,7 +177,8 @@ def train(
                 )
                 if accelerator.is_main_process:
                     with (output / "log.jsonl").open("a") as log:
-                        log.write(json.dumps({"step": step, **values}) + "\n")
+                        place = loader.state_dict()
+                        log.write(json.dumps({"step": step, "epoch": place["epoch"], "samples": place["samples"], **values}) + "\n")
                 accelerator.log(values, step=step)
             if step % config.save_every == 0:
                 save()
@@ -194,6 +195,7 @@ def train(
             lambda left, right: matcher.predict(left, right, iterations=config.evaluation_iterations), pairs, device=accelerator.device
         )
         (output / "evaluation.json").write_text(json.dumps(scores, indent=2) + "\n")
+        accelerator.print(table(scores))
     accelerator.wait_for_everyone()
     loader.close()
     accelerator.end_training()
