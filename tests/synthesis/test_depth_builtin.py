@@ -110,12 +110,13 @@ def test_the_same_bits_in_any_batch_and_with_any_number_of_threads():
         cv2.setNumThreads(threads[1])
 
 
-@pytest.mark.filterwarnings("error")
 def test_it_says_once_that_a_network_is_better(monkeypatch):
     monkeypatch.setattr(builtin, "_said", False)
-    with pytest.warns(BuiltinDepthWarning, match="Depth-Anything-V2"):
+    with pytest.warns(BuiltinDepthWarning, match="Depth-Anything-V2") as said:
         depth(noise(8, 8))
-    depth(noise(8, 8))
+        depth(noise(8, 8))
+    assert len(said) == 1
+    assert said[0].filename == __file__
 
 
 @pytest.mark.parametrize("size", [(240, 320), (480, 640), (700, 930), (1536, 2048)])
