@@ -222,9 +222,8 @@ def test_odd_photos_give_a_right_pair_or_are_counted(tmp_path, depth):
 
 def test_the_largest_disparity_is_the_drawn_share_of_the_photos_width(tar):
     for pair in open_stream(tar, augmentation=AugmentConfig.none()):
-        scale = (SIZE[1]) / min(pair.meta["window"][3], 160)  # a bound: the window holds the margin too
-        assert pair.disparity.max() <= 0.2 * 160 * max(scale, 2.0)
-        assert 0 < pair.meta["disparity_scale"] < 0.2
+        largest = pair.meta["disparity_scale"] * 160 * pair.meta["scale_x"]
+        assert pair.disparity.max() <= largest * (1 + 1e-5) and 0 < pair.meta["disparity_scale"] < 0.2
 
 
 def test_the_uniform_baseline_draws_pixels(tar):

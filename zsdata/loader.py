@@ -16,6 +16,7 @@ from zsdata.finish import Finisher
 from zsdata.meter import Meter
 from zsdata.position import Position
 from zsdata.sample import StereoBatch
+from zsdata.synthesis.depth.builtin import BuiltinDepthWarning
 from zsdata.worker import Prepared, Worker
 
 PREFETCHED_BATCHES = 2  # per worker, ready or in the making
@@ -232,7 +233,7 @@ class _Pipeline:
             several = {
                 "prefetch_factor": PREFETCHED_BATCHES,
                 "multiprocessing_context": context,
-                "worker_init_fn": _use_one_thread,
+                "worker_init_fn": _start_worker,
             }
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "This DataLoader will create")  # how many processes to start is the user's decision
@@ -255,7 +256,8 @@ class _Pipeline:
             shutdown()
 
 
-def _use_one_thread(worker_id: int) -> None:
+def _start_worker(worker_id: int) -> None:
     del worker_id
+    warnings.simplefilter("ignore", BuiltinDepthWarning)  # the process that opened the stream has said it
     torch.set_num_threads(1)
     cv2.setNumThreads(1)

@@ -23,6 +23,7 @@ from zsdata.position import Position
 from zsdata.sample import StereoBatch
 from zsdata.sources import Schedule
 from zsdata.synthesis.depth import DepthEstimator
+from zsdata.synthesis.depth.builtin import warn_once
 from zsdata.synthesis.disparity import AdaptiveDisparity, UniformDisparity
 from zsdata.synthesis.inpaint import Inpainter, load_inpainter
 from zsdata.synthesis.synthesizer import SynthesisConfig
@@ -106,6 +107,8 @@ class ZeroStereoStream(IterableDataset):
             synthesis=synthesis if synthesis is not None else SynthesisConfig(),
             inpainter_needs=tuple(getattr(inpainter, "needs", ())),
         )
+        if self._recipe.depth == "builtin":
+            warn_once()  # here, and not in every worker
         self._worker = Worker(self._recipe)
         self._cpu_finisher: Finisher | None = None
         self._faults = FaultLog(self._budget)

@@ -161,6 +161,7 @@ class Worker:
             "photo_size": list(photo_size),
             "window": list(view.window),
             "mirror": view.mirror,
+            "scale_x": view.scale_x,
             "disparity_scale": scale,
             "largest_disparity_px": float(made.disparity.max()),
             "flip_consistency": round(float(depth.consistency[0]), 6),

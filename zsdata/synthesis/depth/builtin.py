@@ -60,7 +60,7 @@ class BuiltinDepth:
         """
         if images.ndim != 4 or images.shape[1] != 3 or 0 in images.shape[2:] or not images.is_floating_point():
             raise ValueError(f"images must be a float tensor [B, 3, H, W] in 0..255, got {images.dtype} {list(images.shape)}")
-        _warn_once()
+        warn_once()
         photos = images.detach().to("cpu", torch.float32).contiguous().numpy()
         maps = np.empty((len(photos), 1, *photos.shape[2:]), np.float32)
         for photo, inverse_depth in zip(photos, maps, strict=True):
@@ -68,7 +68,8 @@ class BuiltinDepth:
         return torch.from_numpy(maps).to(images.device)
 
 
-def _warn_once() -> None:
+def warn_once() -> None:
+    """Says once per process that a neural estimator is better for real training."""
     global _said
     if not _said:
         _said = True
