@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from trainers.models.checkpoint import load_checkpoint, save_checkpoint
+from trainers.models.igev_stereo import IGEVStereo
 from trainers.models.matcher import Matcher
 from trainers.models.raft_stereo import RAFTStereo
 
 __all__ = ["MATCHERS", "Matcher", "load_checkpoint", "load_matcher", "load_trained", "save_checkpoint"]
 
-MATCHERS: dict[str, type[Matcher]] = {"raft_stereo": RAFTStereo}
+MATCHERS: dict[str, type[Matcher]] = {"raft_stereo": RAFTStereo, "igev_stereo": IGEVStereo}
 
 
 def load_matcher(name: str, **options: Any) -> Matcher:

@@ -28,7 +28,7 @@ def load_checkpoint(matcher: nn.Module, path: str | PathLike[str]) -> None:
             of another shape. The matcher is then as it was.
     """
     path = Path(path)
-    weights = _without_wrapper(_read(path))
+    weights = read_weights(path)
     expected = matcher.state_dict(keep_vars=True)
     for names in _names_of_one_tensor(expected):
         present = [name for name in names if name in weights]
@@ -56,7 +56,8 @@ def save_checkpoint(matcher: nn.Module, path: str | PathLike[str]) -> None:
     save_file({name: tensor.detach().cpu().clone().contiguous() for name, tensor in matcher.state_dict().items()}, path)
 
 
-def _read(path: Path) -> dict[str, Tensor]:
+def read_weights(path: Path) -> dict[str, Tensor]:
+    """The tensors of a .safetensors or .pth file by name, without the prefix of a wrapper; errors as for `load_checkpoint`."""
     if not path.is_file():
         raise FileNotFoundError(f"no checkpoint file {path}")
     if path.suffix not in (".safetensors", ".pth", ".pt", ".ckpt"):
@@ -69,10 +70,6 @@ def _read(path: Path) -> dict[str, Tensor]:
         raise ValueError(f"{path} is damaged: {error}") from error
     if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
         raise ValueError(f"{path} is not a dictionary of tensors; save the model's state_dict() alone")
-    return weights
-
-
-def _without_wrapper(weights: dict[str, Tensor]) -> dict[str, Tensor]:
     if all(name.startswith(WRAPPER_PREFIX) for name in weights):
         return {name.removeprefix(WRAPPER_PREFIX): tensor for name, tensor in weights.items()}
     return dict(weights)

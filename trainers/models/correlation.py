@@ -65,10 +65,13 @@ def correlation_on_demand(left: Tensor, right: Tensor, levels: int, radius: int)
 
 
 def interpolate(volume: Tensor, x: Tensor, radius: int) -> Tensor:
-    """Values of each row of `volume` [..., N] at x - radius, ..., x + radius (x [...]), linear in between and 0 beside it."""
+    """Values of each row of `volume` [..., N] at x - radius, ..., x + radius, linear in between and 0 beside it.
+
+    x is [...], or has axes of 1 where rows share it.
+    """
     columns, weight = neighbours(x, radius)
     size = volume.shape[-1]
-    values = volume.gather(-1, columns.clamp(0, size - 1))
+    values = volume.gather(-1, columns.clamp(0, size - 1).expand(*volume.shape[:-1], -1))
     values = torch.where((columns >= 0) & (columns < size), values, 0.0)
     return torch.lerp(values[..., :-1], values[..., 1:], weight[..., None])
 

@@ -74,10 +74,20 @@ class FeatureEncoder(Trunk):
 
 
 class ContextEncoder(Trunk):
-    """For each GRU level, finest first, its first hidden state and its context, before their activations."""
+    """For each GRU level, finest first, its first hidden state and its context, before their activations.
 
-    def __init__(self, norm: str, downsample: int, hidden_dims: tuple[int, int, int]) -> None:
+    IGEV-Stereo has the same one under other names of the heads: it counts from the image's resolution.
+    """
+
+    def __init__(
+        self,
+        norm: str,
+        downsample: int,
+        hidden_dims: tuple[int, int, int],
+        names: tuple[str, str, str] = ("outputs08", "outputs16", "outputs32"),
+    ) -> None:
         super().__init__(norm, downsample)
+        self.names = names
         self.layer4 = residual_layer(TRUNK_CHANNELS, TRUNK_CHANNELS, norm, stride=2)
         self.layer5 = residual_layer(TRUNK_CHANNELS, TRUNK_CHANNELS, norm, stride=2)
         coarse, middle, fine = hidden_dims
@@ -89,22 +99,24 @@ class ContextEncoder(Trunk):
             return nn.Sequential(ResidualBlock(TRUNK_CHANNELS, TRUNK_CHANNELS, norm), head(outputs))
 
         # Two heads a level: hidden state and context.
-        self.outputs08 = nn.ModuleList(refined_head(fine) for _ in range(2))
-        self.outputs16 = nn.ModuleList(refined_head(middle) for _ in range(2))
-        self.outputs32 = nn.ModuleList(head(coarse) for _ in range(2))
+        self.add_module(names[0], nn.ModuleList(refined_head(fine) for _ in range(2)))
+        self.add_module(names[1], nn.ModuleList(refined_head(middle) for _ in range(2)))
+        self.add_module(names[2], nn.ModuleList(head(coarse) for _ in range(2)))
         initialize(self)
 
     def heads(self, features: Tensor, levels: int) -> list[list[Tensor]]:
         """[hidden, context] of the first `levels` levels, from the trunk's features."""
-        outputs = [[head(features) for head in self.outputs08]]
-        for layer, heads in ((self.layer4, self.outputs16), (self.layer5, self.outputs32))[: levels - 1]:
-            features = layer(features)
-            outputs.append([head(features) for head in heads])
+        outputs: list[list[Tensor]] = []
+        for layer, name in zip((nn.Identity(), self.layer4, self.layer5), self.names, strict=True):
+            if len(outputs) < levels:
+                features = layer(features)
+                outputs.append([head(features) for head in self.get_submodule(name).children()])
         return outputs
 
     def unused(self, levels: int) -> list[nn.Module]:
         """The modules that `heads` does not touch with so few levels."""
-        return [module for pair in ((self.layer4, self.outputs16), (self.layer5, self.outputs32))[levels - 1 :] for module in pair]
+        layers = (self.layer4, self.layer5)[levels - 1 :]
+        return [*layers, *(self.get_submodule(name) for name in self.names[levels:])]
 
 
 def residual_layer(inputs: int, outputs: int, norm: str, stride: int = 1) -> nn.Sequential:

@@ -18,7 +18,7 @@ class Matcher(nn.Module):
     """Base of the matchers: `forward(left, right, iterations, every_iteration)` is theirs, the rest is here.
 
     `forward` returns `(initial, sequence)`: positive disparities [B, 1, H, W] at full resolution, `initial` None where a matcher has
-    none, and the sequence only its last element with `every_iteration=False`.
+    none. With `every_iteration=False`, `initial` is None and the sequence only its last element.
     """
 
     def __init__(self) -> None:

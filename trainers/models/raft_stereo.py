@@ -73,7 +73,7 @@ class RAFTStereo(Matcher):
             self.fnet = FeatureEncoder(n_downsample)
         # Published checkpoints hold the weights of all levels. Those that this configuration never uses take no gradient, which
         # would otherwise stop distributed training.
-        unused = [*self.cnet.unused(n_gru_layers), *[self.update_block.gru16, self.update_block.gru32][n_gru_layers - 1 :]]
+        unused = [*self.cnet.unused(n_gru_layers), *self.update_block.unused()]
         for module in unused:
             module.requires_grad_(False)
 

@@ -1,6 +1,7 @@
 """The recurrent update of RAFT-Stereo: GRUs at up to three resolutions turn correlations into a step of the flow.
 
 Modules carry the published parameter names; `08`, `16`, `32` mean full, half and quarter of the features' resolution.
+IGEV-Stereo shares the GRUs and the convex upsampling.
 """
 
 from __future__ import annotations
@@ -10,13 +11,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 
-class FlowHead(nn.Module):
-    """Hidden state to a flow step [B, 2, h, w]; the vertical half exists in the published weights and is not used."""
+class StepHead(nn.Module):
+    """Hidden state to a step [B, outputs, h, w] of the estimate."""
 
-    def __init__(self, inputs: int, hidden: int = 256) -> None:
+    def __init__(self, inputs: int, outputs: int, hidden: int = 256) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(inputs, hidden, 3, padding=1)
-        self.conv2 = nn.Conv2d(hidden, 2, 3, padding=1)
+        self.conv2 = nn.Conv2d(hidden, outputs, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
         return self.conv2(F.relu(self.conv1(x)))
@@ -61,37 +62,65 @@ class MotionEncoder(nn.Module):
         return torch.cat([motion, flow.to(motion.dtype)], dim=1)
 
 
-class UpdateBlock(nn.Module):
-    """One update of all levels: coarse to fine, each GRU seeing the neighbouring levels."""
+class GRULevels(nn.Module):
+    """The GRUs of all levels, updated coarse to fine, each seeing the neighbouring levels.
 
-    def __init__(self, correlations: int, hidden_dims: tuple[int, int, int], levels: int, upsampling: int) -> None:
+    Args:
+        names: of the GRUs' parameters, finest level first.
+        motion: channels of what the finest GRU is told of the estimate.
+        hidden_dims: channels of the hidden states, coarsest level first.
+        levels: how many of the three are used, the finest first; all exist, as in the published weights.
+    """
+
+    def __init__(self, names: tuple[str, str, str], motion: int, hidden_dims: tuple[int, int, int], levels: int) -> None:
         super().__init__()
         coarse, middle, fine = hidden_dims
-        self.levels = levels
-        self.encoder = MotionEncoder(correlations)
-        self.gru08 = ConvGRU(fine, MotionEncoder.outputs + (middle if levels > 1 else 0))
-        self.gru16 = ConvGRU(middle, fine + (coarse if levels > 2 else 0))
-        self.gru32 = ConvGRU(coarse, middle)
-        self.flow_head = FlowHead(fine)
-        self.mask = nn.Sequential(nn.Conv2d(fine, 256, 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(256, upsampling**2 * 9, 1))
+        self.names, self.levels = names, levels
+        self.add_module(names[0], ConvGRU(fine, motion + (middle if levels > 1 else 0)))
+        self.add_module(names[1], ConvGRU(middle, fine + (coarse if levels > 2 else 0)))
+        self.add_module(names[2], ConvGRU(coarse, middle))
+
+    def grus(self) -> list[nn.Module]:
+        return [self.get_submodule(name) for name in self.names]
+
+    def unused(self) -> list[nn.Module]:
+        """The GRUs that so few levels do not touch."""
+        return self.grus()[self.levels :]
 
     def update_coarse(self, hidden: list[Tensor], context: list[tuple[Tensor, ...]], finest: int) -> list[Tensor]:
         """New hidden states of the levels from the coarsest down to `finest` (1: half, 2: quarter resolution)."""
         hidden = list(hidden)
+        _, middle, coarse = self.grus()
         if self.levels > 2 and finest <= 2:
-            hidden[2] = self.gru32(hidden[2], context[2], halve(hidden[1]))
+            hidden[2] = coarse(hidden[2], context[2], halve(hidden[1]))
         if self.levels > 1 and finest <= 1:
             coarser = [resize_like(hidden[2], hidden[1])] if self.levels > 2 else []
-            hidden[1] = self.gru16(hidden[1], context[1], halve(hidden[0]), *coarser)
+            hidden[1] = middle(hidden[1], context[1], halve(hidden[0]), *coarser)
         return hidden
+
+    def update_all(self, hidden: list[Tensor], context: list[tuple[Tensor, ...]], motion: Tensor) -> list[Tensor]:
+        """New hidden states of all levels."""
+        hidden = self.update_coarse(hidden, context, finest=1)
+        coarser = [resize_like(hidden[1], hidden[0])] if self.levels > 1 else []
+        hidden[0] = self.grus()[0](hidden[0], context[0], motion, *coarser)
+        return hidden
+
+
+class UpdateBlock(GRULevels):
+    """One update of all levels, and the step of the flow that follows from it."""
+
+    def __init__(self, correlations: int, hidden_dims: tuple[int, int, int], levels: int, upsampling: int) -> None:
+        super().__init__(("gru08", "gru16", "gru32"), MotionEncoder.outputs, hidden_dims, levels)
+        fine = hidden_dims[-1]
+        self.encoder = MotionEncoder(correlations)
+        self.flow_head = StepHead(fine, 2)  # the vertical half exists in the published weights and is not used
+        self.mask = nn.Sequential(nn.Conv2d(fine, 256, 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(256, upsampling**2 * 9, 1))
 
     def forward(
         self, hidden: list[Tensor], context: list[tuple[Tensor, ...]], correlations: Tensor, flow: Tensor
     ) -> tuple[list[Tensor], Tensor]:
         """New hidden states of all levels, and the step of the flow [B, 2, h, w]."""
-        hidden = self.update_coarse(hidden, context, finest=1)
-        coarser = [resize_like(hidden[1], hidden[0])] if self.levels > 1 else []
-        hidden[0] = self.gru08(hidden[0], context[0], self.encoder(flow, correlations), *coarser)
+        hidden = self.update_all(hidden, context, self.encoder(flow, correlations))
         return hidden, self.flow_head(hidden[0])
 
     def upsampling_weights(self, hidden: Tensor) -> Tensor:
