@@ -9,6 +9,7 @@ from typing import Any
 
 from trainers.loop import TrainConfig
 from trainers.pairs_on_disk import StereoPair, find_pairs, motorcycle, read_pair
+from trainers.ranks import start_missing_ranks
 from zsdata import AdaptiveDisparity, AugmentConfig, ImageSource, SynthesisConfig, UniformDisparity, ZeroStereoStream
 
 
@@ -138,8 +139,9 @@ def evaluation_pairs(arguments: argparse.Namespace) -> list[StereoPair]:
 
 
 def run(main: Any) -> None:
-    """Runs a trainer's main; a wrong argument or a missing file is one line in words, not a traceback."""
+    """Runs a trainer's main on every rank; a wrong argument or a missing file is one line in words, not a traceback."""
     try:
+        start_missing_ranks()
         main()
     except (ValueError, FileNotFoundError, FileExistsError, NotADirectoryError) as error:
         sys.exit(f"{Path(sys.argv[0]).name}: {error}")
@@ -153,9 +155,7 @@ def _sources(specs: list[str]) -> Any:
     sources = {}
     for spec in specs:
         name, _, rest = spec.partition("=")
-        urls, _, weight = rest.rpartition("@")
-        if not urls:
-            urls, weight = rest, ""
+        urls, weight = rest.rsplit("@", 1) if "@" in rest else (rest, "")
         if not name or not urls:
             raise ValueError(f"a named source is NAME=URL or NAME=URL@WEIGHT; got {spec!r}")
         try:

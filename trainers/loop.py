@@ -16,7 +16,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from trainers import run_folder
-from trainers.evaluate import evaluate, table
+from trainers.evaluate import evaluate, mean_scores, table
 from trainers.models import Matcher, load_checkpoint
 from trainers.pairs_on_disk import StereoPair
 from zsdata import StereoBatch, ZeroStereoStream
@@ -82,6 +82,7 @@ def train(
         tracker: any of Accelerate's, or None.
     """
     accelerator = Accelerator(
+        cpu=not torch.accelerator.is_available(),  # without it, ranks that torchrun starts on a CPU do not find each other
         mixed_precision=config.mixed_precision,
         gradient_accumulation_steps=config.accumulate,
         log_with=tracker,
@@ -194,7 +195,7 @@ def train(
         scores = evaluate(
             lambda left, right: matcher.predict(left, right, iterations=config.evaluation_iterations), pairs, device=accelerator.device
         )
-        (output / "evaluation.json").write_text(json.dumps(scores, indent=2) + "\n")
+        (output / "evaluation.json").write_text(json.dumps({"mean": mean_scores(scores), "pairs": scores}, indent=2) + "\n")
         accelerator.print(table(scores))
     accelerator.wait_for_everyone()
     loader.close()

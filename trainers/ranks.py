@@ -1,0 +1,50 @@
+"""All the ranks that were asked for: on the CPU, `accelerate launch --num_processes N` starts one process only, unless it is told to use MPI."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import psutil
+from accelerate.commands.config.config_args import default_config_file, load_config_from_file
+from accelerate.commands.launch import launch_command_parser
+
+RANKED_BY = ("WORLD_SIZE", "PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE")  # torchrun, Intel MPI, Open MPI, MVAPICH
+
+
+def start_missing_ranks() -> None:
+    """Starts this program once per rank under torchrun where `accelerate launch --cpu` was asked for several processes and started one.
+
+    Then it does not return. Accelerate leaves two traces of such a call: the address of a rendezvous that nobody else will come to, and its own
+    command line in the parent process.
+
+    Raises:
+        ValueError: several processes were asked for, but how many cannot be found out.
+    """
+    on_cpu = os.environ.get("ACCELERATE_USE_CPU", "").lower() in ("1", "true", "yes")
+    if not on_cpu or "MASTER_ADDR" not in os.environ or any(name in os.environ for name in RANKED_BY):
+        return
+    count = _processes_asked_for()
+    if count is None:
+        raise ValueError(
+            "several processes were asked for, but accelerate launch starts one on the CPU; "
+            f"use torchrun --standalone --nproc_per_node N {sys.argv[0]} ..."
+        )
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", str(count), *sys.argv]
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.execv(sys.executable, command)
+
+
+def _processes_asked_for() -> int | None:
+    """`--num_processes` of the accelerate launch that started this process, from its command line or its configuration file."""
+    parent = psutil.Process().parent()
+    words = parent.cmdline() if parent is not None else []
+    for i, word in enumerate(words):
+        if os.path.basename(word) in ("accelerate-launch", "accelerate.commands.launch") or (word == "launch" and i):
+            launched, _ = launch_command_parser().parse_known_args(words[i + 1 :])
+            if launched.num_processes is not None:
+                return launched.num_processes
+            if launched.config_file is not None or os.path.isfile(default_config_file):
+                return getattr(load_config_from_file(launched.config_file), "num_processes", None)
+    return None
