@@ -1,0 +1,387 @@
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from safetensors.torch import load_file, save_file
+
+from tests import oracles_diffusion as oracle
+from tests.scenes import photo_tar
+from zsdata import ZeroStereoStream, load_inpainter
+from zsdata.seeding import rng
+from zsdata.synthesis.inpaint import fill
+from zsdata.synthesis.inpaint.diffusion import SCHEDULERS, latent_mask
+
+diffusers = pytest.importorskip("diffusers")
+transformers = pytest.importorskip("transformers")
+
+PUBLISHED = Path(__file__).resolve().parents[2] / ".." / "shared" / "published"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A small inpainting pipeline with random weights in the layout of Stable Diffusion 2 Inpainting, of a class that diffusers lacks."""
+    path = tmp_path_factory.mktemp("inpainting")
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        small_unet(9).save_pretrained(path / "unet")
+        vae = diffusers.AutoencoderKL(
+            down_block_types=["DownEncoderBlock2D"] * 4,
+            up_block_types=["UpDecoderBlock2D"] * 4,
+            block_out_channels=[4, 4, 8, 8],
+            norm_num_groups=2,
+        )
+        vae.save_pretrained(path / "vae")
+        text = transformers.CLIPTextConfig(vocab_size=4, hidden_size=16, intermediate_size=16, num_hidden_layers=1, num_attention_heads=2)
+        transformers.CLIPTextModel(text).save_pretrained(path / "text_encoder")
+    scheduler = diffusers.PNDMScheduler(
+        beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear", skip_prk_steps=True, steps_offset=1
+    )
+    scheduler.save_pretrained(path / "scheduler")
+    (path / "tokenizer").mkdir()
+    (path / "tokenizer" / "vocab.json").write_text('{"<|startoftext|>": 0, "<|endoftext|>": 1, "a": 2, "a</w>": 3}')
+    (path / "tokenizer" / "merges.txt").write_text("#version: 0.2\n")
+    (path / "tokenizer" / "tokenizer_config.json").write_text(
+        '{"tokenizer_class": "CLIPTokenizer", "model_max_length": 77, "bos_token": "<|startoftext|>", "eos_token": "<|endoftext|>",'
+        ' "pad_token": "!", "unk_token": "<|endoftext|>"}'
+    )
+    (path / "model_index.json").write_text('{"_class_name": "NobodyKnowsThisPipeline"}')
+    return path
+
+
+def small_unet(in_channels):
+    return diffusers.UNet2DConditionModel(
+        in_channels=in_channels,
+        out_channels=4,
+        block_out_channels=[8, 16, 16],
+        norm_num_groups=4,
+        attention_head_dim=4,
+        layers_per_block=1,
+        cross_attention_dim=16,
+        down_block_types=["CrossAttnDownBlock2D", "CrossAttnDownBlock2D", "DownBlock2D"],
+        up_block_types=["UpBlock2D", "CrossAttnUpBlock2D", "CrossAttnUpBlock2D"],
+    )
+
+
+def tiny_autoencoder(halvings):
+    blocks = {"encoder_block_out_channels": (8,) * (halvings + 1), "decoder_block_out_channels": (8,) * (halvings + 1)}
+    return diffusers.AutoencoderTiny(**blocks, num_encoder_blocks=(1,) * (halvings + 1), num_decoder_blocks=(1,) * (halvings + 1))
+
+
+@pytest.fixture
+def copy(folder, tmp_path):
+    """The same pipeline in a folder of its own, to be damaged."""
+    return shutil.copytree(folder, tmp_path / "copy")
+
+
+@pytest.fixture(scope="module")
+def inpainter(folder):
+    return load_inpainter(folder, steps=3)
+
+
+def scenes(count, height=48, width=64):
+    """Images and ragged masks; the last part of each image is a strip of holes, as a warp leaves it."""
+    random = np.random.default_rng(0)
+    right = torch.from_numpy(random.uniform(0, 255, (count, 3, height, width)).astype(np.float32))
+    inpaint_mask = torch.from_numpy(random.uniform(size=(count, 1, height, width)) < 0.05)
+    inpaint_mask[..., -10:] = True
+    return right, inpaint_mask
+
+
+def generators(*indices):
+    return [rng(0, 0, index, "inpaint") for index in indices]
+
+
+def latent_noise(count, height=48, width=64):
+    random = np.random.default_rng(1)
+    return torch.from_numpy(random.standard_normal((count, 4, -(-height // 8), -(-width // 8)), dtype=np.float32))
+
+
+@pytest.mark.skipif(not PUBLISHED.is_dir(), reason="the published pipeline is not here")
+@pytest.mark.parametrize("steps", [4, 50])
+def test_the_published_images_are_reproduced(steps):
+    with np.load(PUBLISHED / "inpainting.npz") as file:
+        published = {name: torch.from_numpy(file[name]) for name in file.files}
+    inpainter = load_inpainter(PUBLISHED / "tiny_inpainting", steps=steps)
+    made = inpainter.inpaint_from_noise((published["warped"] + 1) * 127.5, published["inpaint_mask"], published["noise"])
+    assert torch.allclose(made / 127.5 - 1, published[f"output_{steps}_steps"], rtol=0, atol=1e-4)
+    other = published[f"output_{54 - steps}_steps"]
+    assert (made / 127.5 - 1 - other).abs().max() > 1e-2  # the comparison can tell 4 steps from 50
+
+
+@pytest.mark.parametrize("size", [(48, 64), (43, 61)])
+def test_every_step_is_the_one_of_the_formulas(folder, size):
+    """Against a plain DDIM loop; the folder's scheduler is another one (PNDM), as in Stable Diffusion's own folders."""
+    right, inpaint_mask = scenes(1, *size)
+    noise = latent_noise(1, *size)
+    made = load_inpainter(folder, steps=7).inpaint_from_noise(right, inpaint_mask, noise)
+    unet = diffusers.UNet2DConditionModel.from_pretrained(folder, subfolder="unet")
+    vae = diffusers.AutoencoderKL.from_pretrained(folder, subfolder="vae")
+    text_encoder = transformers.CLIPTextModel.from_pretrained(folder, subfolder="text_encoder")
+    with torch.no_grad():
+        prompt = text_encoder(torch.tensor([[0, 1]])).last_hidden_state  # begin, end
+        expected = oracle.ddim_inpaint(unet, vae, prompt, right[0].numpy(), inpaint_mask[0, 0].numpy(), noise[0].numpy(), steps=7)
+    assert np.std(expected) > 1
+    np.testing.assert_allclose(made[0].numpy(), expected, rtol=0, atol=1e-4 * 127.5)
+
+
+@pytest.mark.parametrize("scheduler", ["ddim", "lcm"])  # lcm adds noise at every step
+def test_a_sample_does_not_depend_on_the_samples_beside_it(folder, scheduler):
+    inpainter = load_inpainter(folder, steps=3, scheduler=scheduler)
+    right, inpaint_mask = scenes(8)
+    whole = inpainter(right, inpaint_mask, generators(*range(8)))
+    for micro_batch in (1, 3, 8):
+        assert torch.equal(fill(inpainter, right, inpaint_mask, generators(*range(8)), {}, micro_batch), whole)
+    order = [5, 0, 7, 2]
+    assert torch.equal(inpainter(right[order], inpaint_mask[order], generators(*order)), whole[order])
+
+
+def test_each_sample_has_noise_of_its_own(inpainter):
+    right, inpaint_mask = scenes(1)
+    one, other = inpainter(right.expand(2, -1, -1, -1), inpaint_mask.expand(2, -1, -1, -1), generators(0, 1))
+    assert (one - other).abs().max() > 1
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.data())
+def test_a_cell_is_known_only_if_all_its_pixels_are(data):
+    height, width = data.draw(st.tuples(st.integers(1, 40), st.integers(1, 40)))
+    mask = data.draw(arrays(bool, (height, width), elements=st.booleans(), fill=st.just(False)))
+    assert np.array_equal(latent_mask(torch.from_numpy(mask)[None, None])[0, 0].numpy(), oracle.latent_mask(mask))
+
+
+@pytest.mark.parametrize("size", [(48, 64), (41, 71), (9, 8)])
+def test_known_pixels_stay_and_holes_are_filled_at_any_size(inpainter, size):
+    right, inpaint_mask = scenes(2, *size)
+    before = right.clone(), inpaint_mask.clone()
+    made = inpainter(right, inpaint_mask, generators(0, 1))
+    holes = inpaint_mask.expand_as(right)
+    assert made.shape == right.shape and made.dtype == torch.float32
+    assert torch.equal(made[~holes], right[~holes])
+    assert made[holes].min() >= 0 and made[holes].max() <= 255 and (made[holes] != right[holes]).float().mean() > 0.9
+    assert torch.equal(right, before[0]) and torch.equal(inpaint_mask, before[1])
+
+
+def test_what_stands_in_the_holes_is_not_looked_at(inpainter):
+    right, inpaint_mask = scenes(1)
+    filled = inpainter(right, inpaint_mask, generators(0))
+    assert torch.equal(inpainter(right.masked_fill(inpaint_mask, float("nan")), inpaint_mask, generators(0)), filled)
+
+
+@pytest.mark.parametrize(
+    "scheduler",
+    [
+        *SCHEDULERS,
+        "DDPMScheduler",
+        "DPMSolverSinglestepScheduler",
+        "EulerAncestralDiscreteScheduler",
+        "HeunDiscreteScheduler",
+        "PNDMScheduler",
+        "UniPCMultistepScheduler",
+    ],
+)
+def test_other_schedulers_run_and_repeat_themselves(folder, scheduler):
+    inpainter = load_inpainter(folder, steps=4, scheduler=scheduler)
+    right, inpaint_mask = scenes(2)
+    made = inpainter(right, inpaint_mask, generators(0, 1))
+    assert torch.isfinite(made).all() and inpainter.scheduler == SCHEDULERS.get(scheduler, scheduler)
+    assert torch.equal(inpainter(right, inpaint_mask, generators(0, 1)), made)
+
+
+def test_eulers_steps_are_those_of_ddim(copy):
+    """Euler's method in units of sigma is DDIM in other words, once both end without noise; it scales its latents, and DDIM does not."""
+    path = copy / "scheduler" / "scheduler_config.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "set_alpha_to_one": True, "timestep_spacing": "leading"}))
+    right, inpaint_mask = scenes(1)
+    ddim, euler = (load_inpainter(copy, steps=5, scheduler=name)(right, inpaint_mask, generators(0)) for name in ("ddim", "euler"))
+    assert torch.allclose(euler, ddim, rtol=0, atol=0.02)
+
+
+def test_a_tiny_autoencoder_can_take_the_place_of_the_pipelines_own(copy, inpainter):
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        tiny_autoencoder(halvings=3).save_pretrained(copy / "tiny")
+    shutil.rmtree(copy / "vae")
+    right, inpaint_mask = scenes(2, 41, 64)
+    made = load_inpainter(copy, steps=3, autoencoder=str(copy / "tiny"))(right, inpaint_mask, generators(0, 1))
+    assert torch.isfinite(made).all() and not torch.equal(made, inpainter(right, inpaint_mask, generators(0, 1)))
+    (copy / "tiny").rename(copy / "vae")  # or be the pipeline's own
+    assert torch.equal(load_inpainter(copy, steps=3)(right, inpaint_mask, generators(0, 1)), made)
+
+
+def test_half_precision_stays_close(folder, inpainter):
+    right, inpaint_mask = scenes(1)
+    half = load_inpainter(folder, steps=3, dtype="bf16")
+    made = half(right, inpaint_mask, generators(0))
+    assert half.dtype == torch.bfloat16 and inpainter.dtype == torch.float32 and made.dtype == torch.float32
+    assert 0 < (made - inpainter(right, inpaint_mask, generators(0))).abs().mean() < 10
+
+
+def test_an_autocast_around_it_changes_nothing(inpainter):
+    right, inpaint_mask = scenes(1)
+    with torch.autocast("cpu", torch.bfloat16):
+        made = inpainter(right, inpaint_mask, generators(0))
+    assert torch.equal(made, inpainter(right, inpaint_mask, generators(0)))
+
+
+@pytest.mark.filterwarnings("ignore:.*script_method.*:DeprecationWarning")  # PyTorch's own compiler
+def test_a_compiled_unet_is_used(folder, inpainter):
+    right, inpaint_mask = scenes(1)
+    compiled = load_inpainter(folder, steps=3, compile=True)
+    assert compiled._unet._compiled_call_impl is not None and inpainter._unet._compiled_call_impl is None
+    with torch.compiler.set_stance("force_eager"):
+        assert torch.equal(compiled(right, inpaint_mask, generators(0)), inpainter(right, inpaint_mask, generators(0)))
+
+
+def test_no_global_random_number_is_drawn(folder):
+    before = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
+    load_inpainter(folder, steps=2, scheduler="tcd")(*scenes(1), generators(0))
+    assert torch.equal(torch.get_rng_state(), before[0]) and np.array_equal(np.random.get_state()[1], before[1])  # noqa: NPY002
+
+
+def test_a_pipeline_deeper_in_the_folder_is_found_and_named(folder):
+    inpainter = load_inpainter(folder.parent, steps=2, subfolder=folder.name)
+    assert (inpainter.name, inpainter.subfolder, inpainter.revision, inpainter.steps) == (str(folder.parent), folder.name, None, 2)
+
+
+def test_a_hub_id_is_found_in_the_cache_without_network(folder, tmp_path):
+    repository = tmp_path / "hub" / "models--somebody--pipelines"
+    shutil.copytree(folder, repository / "snapshots" / ("0" * 40) / "inpainting")
+    (repository / "refs").mkdir()
+    (repository / "refs" / "v1").write_text("0" * 40)
+    program = (
+        "from zsdata import load_inpainter\n"
+        'inpainter = load_inpainter("somebody/pipelines", steps=2, subfolder="inpainting", revision="v1")\n'
+        'assert inpainter.revision == "v1"\n'
+        "try:\n"
+        '    load_inpainter("somebody/pipelines", steps=2, revision="v1")\n'
+        "except OSError as error:\n"
+        '    assert "somebody/pipelines/scheduler cannot be loaded" in str(error)\n'
+    )
+    offline = {**os.environ, "HF_HOME": str(tmp_path), "HF_HUB_CACHE": str(tmp_path / "hub"), "HF_HUB_OFFLINE": "1"}
+    result = subprocess.run([sys.executable, "-c", program], env=offline, capture_output=True, text=True, timeout=120)
+    assert result.returncode == 0, result.stderr
+
+
+def test_a_pipeline_works_in_the_stream(folder, tmp_path):
+    photos = photo_tar(tmp_path / "photos.tar", 2)
+    stream = ZeroStereoStream(photos, size=(64, 96), inpaint=folder, depth=lambda images: images.mean(1, keepdim=True))
+    pairs = list(stream)
+    holes = [pair.right_clean[pair.masks.inpaint.expand(3, -1, -1)] for pair in pairs]
+    assert len(pairs) == 2 and all(len(values) and torch.isfinite(values).all() and values.std() > 0 for values in holes)
+
+
+def test_out_of_memory_says_what_to_lower(folder, monkeypatch):
+    inpainter = load_inpainter(folder, steps=2)
+
+    def full(*_, **__):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(inpainter._unet, "forward", full)
+    with pytest.raises(MemoryError, match=r"3 images of 48x64.*lower micro_batch \(now 3\)"):
+        inpainter(*scenes(3), generators(0, 1, 2))
+    with pytest.raises(MemoryError, match=r"1 images of 48x64.*: take a smaller crop"):
+        inpainter(*scenes(1), generators(0))
+
+
+def test_a_missing_package_is_named_with_its_cure(folder, monkeypatch):
+    for package in ("diffusers", "transformers"):
+        with monkeypatch.context() as patch, pytest.raises(ImportError, match=r'pip install "zsdata\[diffusion\]"'):
+            patch.setitem(sys.modules, package, None)
+            load_inpainter(folder)
+
+
+@pytest.mark.parametrize("part", ["unet", "vae", "text_encoder", "tokenizer", "scheduler"])
+def test_a_missing_part_is_named(copy, part):
+    shutil.rmtree(copy / part)
+    with pytest.raises(FileNotFoundError, match=f"lacks {part}/"):
+        load_inpainter(copy)
+
+
+@pytest.mark.parametrize("part", ["unet", "vae", "text_encoder"])
+def test_pickled_weights_are_refused(copy, part):
+    safe = next((copy / part).glob("*.safetensors"))
+    torch.save(load_file(safe), safe.with_name("pytorch_model.bin" if part == "text_encoder" else "diffusion_pytorch_model.bin"))
+    safe.rename(safe.with_name("of_something_else.safetensors"))
+    with pytest.raises(OSError, match=rf"{part} cannot be loaded.*pickled .bin weights are refused"):
+        load_inpainter(copy)
+    safe.with_name("of_something_else.safetensors").unlink()
+    with pytest.raises(FileNotFoundError, match=rf'{part}" holds no weights in safetensors \(pickled'):
+        load_inpainter(copy)
+
+
+@pytest.mark.parametrize("part", ["unet", "vae", "text_encoder"])
+def test_damaged_and_incomplete_weights_are_named(copy, part):
+    path = next((copy / part).glob("*.safetensors"))
+    weights = load_file(path)
+    gone = sorted(weights)[0]
+    del weights[gone]
+    save_file(weights, path, metadata={"format": "pt"})
+    with pytest.raises(ValueError, match=f'{part} lacks 1 weights, "'):
+        load_inpainter(copy)
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(OSError, match=f"{part} cannot be loaded"):
+        load_inpainter(copy)
+
+
+def test_a_plain_text_to_image_unet_is_refused(copy):
+    small_unet(4).save_pretrained(copy / "unet")
+    with pytest.raises(ValueError, match=r"no inpainting model: its U-Net takes 4 channels, inpainting takes 9"):
+        load_inpainter(copy)
+
+
+def test_an_autoencoder_of_another_latent_space_is_refused(folder, tmp_path):
+    tiny_autoencoder(halvings=1).save_pretrained(tmp_path)
+    with pytest.raises(ValueError, match=r"makes 4 channels of 2x2 pixels; .* are 4 channels of 8x8"):
+        load_inpainter(folder, autoencoder=str(tmp_path))
+    with pytest.raises(ValueError, match="is a UNet2DConditionModel; an autoencoder here is one of"):
+        load_inpainter(folder, autoencoder=str(folder / "unet"))
+
+
+def test_a_text_encoder_of_another_pipeline_is_refused(copy):
+    text = transformers.CLIPTextConfig(vocab_size=4, hidden_size=8, intermediate_size=16, num_hidden_layers=1, num_attention_heads=2)
+    transformers.CLIPTextModel(text).save_pretrained(copy / "text_encoder")
+    with pytest.raises(ValueError, match="the text encoder gives 8 channels, the U-Net takes 16"):
+        load_inpainter(copy)
+
+
+def test_a_name_that_is_nowhere_is_said(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        load_inpainter(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"steps": 0}, "steps is 1 or more; got 0"),
+        ({"steps": 1001}, "1001"),
+        ({"dtype": "int8"}, "got int8"),
+        ({"scheduler": "fastest"}, 'got "fastest"'),
+        ({"scheduler": "NoScheduler"}, 'got "NoScheduler"'),
+        ({"scheduler": "FlowMatchEulerDiscreteScheduler"}, "another kind of model"),
+        ({"scheduler": "RePaintScheduler"}, "another kind of model"),
+    ],
+)
+def test_bad_options_are_refused(folder, options, message):
+    with pytest.raises(ValueError, match=message):
+        load_inpainter(folder, **options)
+
+
+def test_bad_inputs_are_refused(inpainter):
+    right, inpaint_mask = scenes(2)
+    with pytest.raises(ValueError, match=r"right must be \[B, 3, H, W\]; got \[2, 1, 48, 64\]"):
+        inpainter(right[:, :1], inpaint_mask, generators(0, 1))
+    with pytest.raises(ValueError, match=r"inpaint_mask must be bool \[2, 1, 48, 64\]; got torch.float32"):
+        inpainter(right, inpaint_mask.float(), generators(0, 1))
+    with pytest.raises(ValueError, match="2 samples, 1 generators"):
+        inpainter(right, inpaint_mask, generators(0))
+    with pytest.raises(ValueError, match=r"noise must be \[2, 4, 6, 8\].*got \[2, 4, 48, 64\]"):
+        inpainter.inpaint_from_noise(right, inpaint_mask, torch.zeros(2, 4, 48, 64))

@@ -1,0 +1,147 @@
+"""The parts of an inpainting pipeline in the diffusers format, loaded one by one.
+
+Fine-tuned checkpoints name a pipeline class in model_index.json that diffusers does not know, so that file is not read: the layout is
+fixed, and so are the classes. Weights come from safetensors alone, since pickled ones can run code.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from safetensors import SafetensorError
+from torch import Tensor
+
+CELL_PX = 8  # a latent cell is 8x8 pixels in every Stable Diffusion
+LATENT_CHANNELS = 4
+INPAINTING_CHANNELS = 2 * LATENT_CHANNELS + 1  # noisy latent, mask, latent of the masked image
+
+WEIGHTED_PARTS = ("unet", "vae", "text_encoder")
+OTHER_PARTS = ("scheduler", "tokenizer")
+
+
+class DiffusionParts(NamedTuple):
+    """What inpainting needs of a pipeline, on the CPU; the networks in evaluation mode and without gradients."""
+
+    unet: Any  # diffusers.UNet2DConditionModel with 9 input channels
+    autoencoder: Any  # diffusers.AutoencoderKL or AutoencoderTiny
+    scheduler_config: Mapping[str, Any]
+    prompt: Tensor  # [1, 2, D]: the empty prompt's embedding, not padded (begin, end), which is what the networks were tuned with
+
+
+def load_diffusion_parts(
+    name: str,
+    subfolder: str = "",
+    revision: str | None = None,
+    autoencoder: str | None = None,
+    dtype: torch.dtype = torch.float32,
+) -> DiffusionParts:
+    """Loads U-Net, autoencoder and scheduler configuration; embeds the empty prompt and drops the text encoder.
+
+    Args:
+        name: a Hub id ("owner/name") or a local folder that holds unet/, vae/, text_encoder/, tokenizer/ and scheduler/.
+        subfolder: where in it the pipeline lies; "" is its root.
+        revision: branch, tag or commit of a Hub id.
+        autoencoder: a Hub id or folder of another autoencoder (`AutoencoderKL` or `AutoencoderTiny`) to use in place of vae/.
+        dtype: of the U-Net, the autoencoder and the prompt; the prompt is computed in float32.
+
+    Raises:
+        ImportError: diffusers or transformers is not installed.
+        FileNotFoundError, OSError: the folder, a part of it or its safetensors weights are missing or damaged.
+        ValueError: the parts are not those of an inpainting pipeline, or weights are incomplete.
+    """
+    try:
+        from diffusers import (  # pyright: ignore[reportPrivateImportUsage]
+            AutoencoderKL,  # pyright: ignore[reportPrivateImportUsage]
+            AutoencoderTiny,  # pyright: ignore[reportPrivateImportUsage]
+            DDIMScheduler,  # pyright: ignore[reportPrivateImportUsage]
+            UNet2DConditionModel,  # pyright: ignore[reportPrivateImportUsage]
+        )
+        from transformers import CLIPTextModel, CLIPTokenizerFast  # pyright: ignore[reportAttributeAccessIssue]
+    except ImportError as error:
+        raise ImportError(f'inpaint="{name}" needs diffusers and transformers: pip install "zsdata[diffusion]"') from error
+    _check_folder(name, subfolder, autoencoder)
+
+    scheduler_config: Any = _load(DDIMScheduler.load_config, name, subfolder, "scheduler", revision)
+
+    unet = _load_weights(UNet2DConditionModel, name, subfolder, "unet", revision, torch_dtype=dtype)
+    if unet.config.in_channels != INPAINTING_CHANNELS:
+        raise ValueError(
+            f'inpaint="{name}" is no inpainting model: its U-Net takes {unet.config.in_channels} channels, inpainting takes '
+            f"{INPAINTING_CHANNELS} (latent, mask, masked image); take ZeroStereo's checkpoint or Stable Diffusion 2 Inpainting"
+        )
+
+    autoencoder_place = (name, subfolder, "vae", revision) if autoencoder is None else (autoencoder, "", "", None)
+    autoencoders = {"AutoencoderKL": AutoencoderKL, "AutoencoderTiny": AutoencoderTiny}
+    autoencoder_config: Any = _load(AutoencoderKL.load_config, *autoencoder_place)
+    kind = autoencoder_config.get("_class_name")
+    if kind not in autoencoders:
+        raise ValueError(f"{_where(*autoencoder_place[:3])} is a {kind}; an autoencoder here is one of {sorted(autoencoders)}")
+    images_to_latents = _load_weights(autoencoders[kind], *autoencoder_place, torch_dtype=dtype)
+    config = images_to_latents.config
+    cell_px = 2 ** (len(config.block_out_channels if kind == "AutoencoderKL" else config.encoder_block_out_channels) - 1)
+    if (cell_px, config.latent_channels) != (CELL_PX, LATENT_CHANNELS):
+        raise ValueError(
+            f"{_where(*autoencoder_place[:3])} makes {config.latent_channels} channels of {cell_px}x{cell_px} pixels; "
+            f"Stable Diffusion's latents are {LATENT_CHANNELS} channels of {CELL_PX}x{CELL_PX}"
+        )
+
+    tokenizer = _load(CLIPTokenizerFast.from_pretrained, name, subfolder, "tokenizer", revision)
+    text_encoder = _load_weights(CLIPTextModel, name, subfolder, "text_encoder", revision)
+    with torch.no_grad():
+        prompt = text_encoder.float()(tokenizer("", padding=False, return_tensors="pt").input_ids)[0]
+    if prompt.shape[-1] != unet.config.cross_attention_dim:
+        raise ValueError(
+            f'inpaint="{name}": the text encoder gives {prompt.shape[-1]} channels, the U-Net takes {unet.config.cross_attention_dim}; '
+            "the parts belong to different pipelines"
+        )
+    return DiffusionParts(unet, images_to_latents, scheduler_config, prompt.to(dtype))
+
+
+def _where(name: str, subfolder: str, part: str) -> str:
+    return "/".join(filter(None, (name, subfolder, part)))
+
+
+def _load(load: Any, name: str, subfolder: str, part: str, revision: str | None, **options: Any) -> Any:
+    try:
+        inner = "/".join(filter(None, (subfolder, part)))
+        return load(name, revision=revision, **({"subfolder": inner} if inner else {}), **options)
+    except (OSError, SafetensorError) as error:
+        raise OSError(
+            f"{_where(name, subfolder, part)} cannot be loaded. It must be there, complete, its weights (where it has any) in safetensors; "
+            f"pickled .bin weights are refused, since they can run code. {type(error).__name__}: {error}"
+        ) from error
+
+
+def _load_weights(network: Any, name: str, subfolder: str, part: str, revision: str | None, **options: Any) -> Any:
+    """A network with all of its weights; the libraries themselves fill gaps with random numbers and only log it."""
+    options |= {"use_safetensors": True, "output_loading_info": True}
+    loaded, report = _load(network.from_pretrained, name, subfolder, part, revision, **options)
+    if report["missing_keys"]:
+        missing = sorted(report["missing_keys"])
+        raise ValueError(f'{_where(name, subfolder, part)} lacks {len(missing)} weights, "{missing[0]}" for one; download or save it again')
+    return loaded.eval().requires_grad_(False)
+
+
+def _check_folder(name: str, subfolder: str, autoencoder: str | None) -> None:
+    """Says what a local folder lacks, before a library asks the Hub for it."""
+    for place in filter(None, (name, autoencoder)):
+        if not os.path.isdir(place) and not re.fullmatch(r"[\w.-]+/[\w.-]+", place):
+            raise FileNotFoundError(f'"{place}" is neither a folder nor a Hub id ("owner/name")')
+    weighted = [Path(name, subfolder, part) for part in WEIGHTED_PARTS if part != "vae" or autoencoder is None]
+    needed = weighted + [Path(name, subfolder, part) for part in OTHER_PARTS]
+    if os.path.isdir(name):
+        if missing := [path.name for path in needed if not path.is_dir()]:
+            raise FileNotFoundError(
+                f'"{Path(name, subfolder)}" is no inpainting pipeline: it lacks {", ".join(f"{part}/" for part in missing)}. '
+                "If the pipeline lies deeper in the folder, name its `subfolder`."
+            )
+    else:
+        weighted = []
+    for path in weighted + ([Path(autoencoder)] if autoencoder and os.path.isdir(autoencoder) else []):
+        if not any(path.glob("*.safetensors")):
+            raise FileNotFoundError(f'"{path}" holds no weights in safetensors (pickled .bin weights are refused, since they can run code)')
