@@ -108,6 +108,14 @@ def test_without_a_right_end_the_left_surface_goes_on():
     assert torch.allclose(filled[..., -4:], GREEN.view(1, 3, 1, 1), atol=1e-3)
 
 
+def test_a_hole_at_the_left_border_takes_its_own_rows_right_surface():
+    right = torch.cat([RED.view(1, 3, 1, 1).expand(1, 3, 20, 40), GREEN.view(1, 3, 1, 1).expand(1, 3, 20, 40)], -1)
+    disparity = torch.tensor([9.0, 1.0]).repeat_interleave(40).expand(1, 1, 20, 80)
+    inpaint_mask = (torch.arange(80) < 6).expand(1, 1, 20, 80)
+    filled = inpaint(right, inpaint_mask, None, disparity)  # what lies before column 0 in memory, the row above's end, is farther
+    assert torch.allclose(filled[..., :6], RED.view(1, 3, 1, 1), atol=1e-3)
+
+
 def test_a_speck_of_the_foreground_in_a_hole_is_no_edge():
     _, warped = two_surfaces()
     hole = square_hole(warped)
