@@ -11,6 +11,7 @@ from trainers.loop import TrainConfig
 from trainers.pairs_on_disk import StereoPair, find_pairs, motorcycle, read_pair
 from trainers.ranks import start_missing_ranks
 from zsdata import AdaptiveDisparity, AugmentConfig, ImageSource, SynthesisConfig, UniformDisparity, ZeroStereoStream
+from zsdata.faults import NoUsablePhoto, TooManyFaults
 
 
 def add_training_arguments(parser: argparse.ArgumentParser) -> None:
@@ -143,7 +144,7 @@ def run(main: Any) -> None:
     try:
         start_missing_ranks()
         main()
-    except (ValueError, FileNotFoundError, FileExistsError, NotADirectoryError) as error:
+    except (ValueError, ImportError, OSError, NoUsablePhoto, TooManyFaults) as error:
         sys.exit(f"{Path(sys.argv[0]).name}: {error}")
     except KeyboardInterrupt:
         sys.exit(130)

@@ -1,4 +1,4 @@
-"""All the ranks that were asked for: on the CPU, `accelerate launch --num_processes N` starts one process only, unless it is told to use MPI."""
+"""All the ranks that were asked for: on the CPU, `accelerate launch --num_processes N` starts a single process, unless told to use MPI."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ RANKED_BY = ("WORLD_SIZE", "PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_S
 def start_missing_ranks() -> None:
     """Starts this program once per rank under torchrun where `accelerate launch --cpu` was asked for several processes and started one.
 
-    Then it does not return. Accelerate leaves two traces of such a call: the address of a rendezvous that nobody else will come to, and its own
-    command line in the parent process.
+    Then it does not return. Accelerate leaves two traces of such a call: the address of a rendezvous that nobody else will come to, and
+    its own command line in the parent process.
 
     Raises:
         ValueError: several processes were asked for, but how many cannot be found out.

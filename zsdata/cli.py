@@ -19,7 +19,7 @@ from tqdm import tqdm
 import zsdata
 from zsdata.augment import AugmentConfig
 from zsdata.example_photos import EXAMPLE_PHOTOS, pack_example_photos
-from zsdata.faults import BadShard
+from zsdata.faults import BadShard, NoUsablePhoto, TooManyFaults
 from zsdata.preview import contact_sheet
 from zsdata.sample import StereoBatch
 from zsdata.source.archive import Problem
@@ -57,12 +57,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         where = f"{error.filename}: " if error.filename and error.strerror else ""
         return _fail(where + (error.strerror or str(error)), USER_ERROR)
-    except (ValueError, ImportError, BadShard) as error:
+    except (ValueError, ImportError, BadShard, NoUsablePhoto, TooManyFaults) as error:
         return _fail(str(error), USER_ERROR)
-    except RuntimeError as error:
-        if error.__cause__ is not None:  # something broke inside: its traceback is needed
-            raise
-        return _fail(str(error), USER_ERROR)  # the stream gave up: too many photos cannot be used
 
 
 def _fail(message: str, status: int) -> int:

@@ -44,6 +44,10 @@ class TooManyFaults(RuntimeError):
     """The failure budget is spent."""
 
 
+class NoUsablePhoto(RuntimeError):
+    """Neither a sample's photo nor any of its spares could be used."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class FailureBudget:
     """How many photos may be refused before the run stops: more than `count` of them and more than `rate` of all that were tried."""

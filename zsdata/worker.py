@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from zsdata.faults import BadPhoto, BadShard
+from zsdata.faults import BadPhoto, BadShard, NoUsablePhoto
 from zsdata.meter import Meter
 from zsdata.plan import Choice
 from zsdata.seeding import rng
@@ -96,7 +96,8 @@ class Worker:
         """Sample `index` of `epoch` up to the holes; a photo that cannot be used is replaced by the sample's next spare.
 
         Raises:
-            RuntimeError: when no spare can be used either, with the reasons; or when a step fails, with the sample named.
+            NoUsablePhoto: when no spare can be used either, with the reasons.
+            RuntimeError: when a step fails, with the sample named.
         """
         sources = self._recipe.schedule.at(epoch)
         rejected: list[tuple[str, str, str, str]] = []
@@ -115,7 +116,7 @@ class Worker:
                     ) from error
                 choice = sources.plan.spare(epoch, index, len(rejected) - 1)
         last = "; ".join(f"{key} in {shard}: {reason}" for _, shard, key, reason in rejected[-3:])
-        raise RuntimeError(
+        raise NoUsablePhoto(
             f'no usable photo for sample {index} of epoch {epoch}: {len(rejected)} of source "{rejected[0][0]}" were refused, '
             f"the last ones: {last}. `zsdata verify` lists what is wrong with its shards."
         )

@@ -42,7 +42,15 @@ def run_training(tar, output, config, resume=None, loss=sequence_loss, **options
     matcher.freeze_bn()
     stream = open_stream(tar, **options)
     train(
-        matcher, loss, stream, config, output=output, model_config={"model": "raft_stereo", "options": SMALL}, arguments={}, resume=resume, tracker=None
+        matcher,
+        loss,
+        stream,
+        config,
+        output=output,
+        model_config={"model": "raft_stereo", "options": SMALL},
+        arguments={},
+        resume=resume,
+        tracker=None,
     )
     return matcher
 
@@ -144,14 +152,38 @@ def test_a_loss_that_is_not_finite_names_the_samples(tar, tmp_path):
 
 
 def launch(arguments, processes, script="trainers/raft.py"):
-    command = [str(Path(sys.executable).with_name("accelerate")), "launch", "--cpu", "--num_processes", str(processes), "--num_machines", "1"]
+    command = [
+        str(Path(sys.executable).with_name("accelerate")),
+        "launch",
+        "--cpu",
+        "--num_processes",
+        str(processes),
+        "--num_machines",
+        "1",
+    ]
     command += ["--mixed_precision", "no", "--dynamo_backend", "no"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     return subprocess.run([*command, script, *map(str, arguments)], cwd=ROOT, capture_output=True, text=True, env=environment, timeout=240)
 
 
 def arguments_for(tar, output, *more):
-    return ["--sources", tar, "--size", 64, 96, "--batch-size", 1, "--iterations", 2, "--workers", 1, "--output", output, *SMALL_ARGUMENTS, *more]
+    return [
+        "--sources",
+        tar,
+        "--size",
+        64,
+        96,
+        "--batch-size",
+        1,
+        "--iterations",
+        2,
+        "--workers",
+        1,
+        "--output",
+        output,
+        *SMALL_ARGUMENTS,
+        *more,
+    ]
 
 
 def test_two_ranks_train_on_disjoint_samples_in_equal_steps(tar, tmp_path):
