@@ -10,9 +10,9 @@ from pathlib import Path
 
 from zsdata.source.pack import PackReport, pack
 
-# The scenes among the images inside scikit-image's wheel; the others are textures, drawings, microscopy and the sky, and the motorcycle
-# pair, which is kept for judging what was trained. EXAMPLE_PHOTOS = ("astronaut.png", "camera.png", "chelsea.png", "coffee.png",
-# "rocket.jpg")
+# The scenes among the images inside scikit-image's wheel; the others are textures, drawings, microscopy and the sky, and the
+# motorcycle pair, which is kept for judging what was trained.
+EXAMPLE_PHOTOS = ("astronaut.png", "camera.png", "chelsea.png", "coffee.png", "rocket.jpg")
 
 
 def example_photos() -> list[Path]:

@@ -1,5 +1,6 @@
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -106,6 +107,7 @@ def latent_noise(count, height=48, width=64):
 
 
 @pytest.mark.skipif(not PUBLISHED.is_dir(), reason="the published pipeline is not here")
+@pytest.mark.skipif(int(transformers.__version__.split(".")[0]) < 5, reason="its text encoder was saved by transformers 5")
 @pytest.mark.parametrize("steps", [4, 50])
 def test_the_published_images_are_reproduced(steps):
     with np.load(PUBLISHED / "inpainting.npz") as file:
@@ -325,7 +327,7 @@ def test_damaged_and_incomplete_weights_are_named(copy, part):
     gone = sorted(weights)[0]
     del weights[gone]
     save_file(weights, path, metadata={"format": "pt"})
-    with pytest.raises(ValueError, match=f'{part} lacks 1 weights, "'):
+    with pytest.raises(ValueError, match=re.escape(gone)):
         load_inpainter(copy)
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(OSError, match=f"{part} cannot be loaded"):

@@ -123,7 +123,10 @@ def _load_weights(network: Any, name: str, subfolder: str, part: str, revision: 
     loaded, report = _load(network.from_pretrained, name, subfolder, part, revision, **options)
     if report["missing_keys"]:
         missing = sorted(report["missing_keys"])
-        raise ValueError(f'{_where(name, subfolder, part)} lacks {len(missing)} weights, "{missing[0]}" for one; download or save it again')
+        raise ValueError(
+            f'{_where(name, subfolder, part)} lacks {len(missing)} weights, "{missing[0]}" for one; download it again, or upgrade '
+            "diffusers and transformers: a text encoder saved by transformers 5 has names that older ones do not know"
+        )
     return loaded.eval().requires_grad_(False)
 
 
