@@ -41,7 +41,9 @@ class Finisher:
             context = {name: tensor.to(self.device, non_blocking=True).float() for name, tensor in prepared.context.items()}
         left_clean = left.float()
         with meter.stage("inpaint"):
-            right_clean = fill(self.inpainter, right.float(), inpaint, self._generators(prepared, "inpaint"), context, self.micro_batch)
+            filled = fill(self.inpainter, right.float(), inpaint, self._generators(prepared, "inpaint"), context, self.micro_batch)
+            width = left.shape[-1]  # the right view reaches further, for the inpainter's sake
+            right_clean, inpaint = filled[..., :width].contiguous(), inpaint[..., :width].contiguous()
         with meter.stage("augment"):
             left, right = augment(left_clean, right_clean, self._generators(prepared, "augment"), self.augmentation)
         masks = Masks(nonocclusion, inpaint, valid=disparity > 0)

@@ -20,7 +20,7 @@ from zsdata.source.photo import decode_rgb
 from zsdata.sources import Schedule, SourceSet
 from zsdata.synthesis.depth import DepthEstimator, load_depth
 from zsdata.synthesis.disparity import AdaptiveDisparity, UniformDisparity
-from zsdata.synthesis.synthesizer import SynthesisConfig, estimate_depth, synthesize
+from zsdata.synthesis.synthesizer import INPAINT_CONTEXT_PX, SynthesisConfig, estimate_depth, synthesize
 from zsdata.synthesis.view import ViewConfig, draw_view, view_photo
 
 SHORTEST_SIDE_PX = 32  # a photo with a shorter side shows no scene
@@ -45,7 +45,8 @@ class Recipe:
 class Prepared:
     """A pair before inpainting, as it crosses the process border: images uint8, masks bool.
 
-    One sample has no batch axis and one `meta`; `stack` makes a batch of them. `right` is 0 in its holes; `right_disparity` and
+    One sample has no batch axis and one `meta`; `stack` makes a batch of them. `right`, `inpaint` and the context reach INPAINT_CONTEXT_PX
+    columns beyond the crop's right edge. `right` is 0 in its holes; `right_disparity` and
     `background` are there where the inpainter needs them. `rejected` lists (source, shard, key, reason) of the photos that could not be
     used.
     """
@@ -143,15 +144,16 @@ class Worker:
         with meter.stage("warp"):
             made = synthesize(left, depth, view, photo_size, scale, recipe.synthesis)
 
-        warped, context = made.warped, {}
+        context = {}
         if "right_disparity" in recipe.inpainter_needs:
-            context["right_disparity"] = warped.right_disparity[0].contiguous()
+            context["right_disparity"] = made.right_disparity[0].contiguous()
         if "background" in recipe.inpainter_needs:
             with meter.stage("background"):
                 context["background"] = (
                     torch.from_numpy(self._background(sources, choice, epoch, index, photo)).permute(2, 0, 1).contiguous()
                 )
         member = manifest.member(choice.member)
+        hole = made.inpaint_mask[..., : recipe.size[1]]
         meta = {
             "seed": recipe.seed,
             "epoch": epoch,
@@ -166,15 +168,15 @@ class Worker:
             "disparity_scale": scale,
             "largest_disparity_px": float(made.disparity.max()),
             "flip_consistency": round(float(depth.consistency[0]), 6),
-            "hole_share": float(warped.inpaint_mask.count_nonzero()) / warped.inpaint_mask.numel(),
+            "hole_share": float(hole.count_nonzero()) / hole.numel(),
         }
         return Prepared(
             left=_to_uint8(made.left),
-            right=_to_uint8(warped.right),
+            right=_to_uint8(made.right),
             disparity=made.disparity[0].contiguous(),
             confidence=made.confidence[0].contiguous(),
-            nonocclusion=warped.nonocclusion_mask[0].contiguous(),
-            inpaint=warped.inpaint_mask[0].contiguous(),
+            nonocclusion=made.nonocclusion_mask[0].contiguous(),
+            inpaint=made.inpaint_mask[0].contiguous(),
             context=context,
             meta=meta,
             rejected=rejected,
@@ -182,7 +184,7 @@ class Worker:
         )
 
     def _background(self, sources: SourceSet, choice: Choice, epoch: int, index: int, photo: np.ndarray) -> np.ndarray:
-        """Another photo of the source at the crop's size; the photo itself where the source has no other that can be read."""
+        """Another photo of the source at the size of the right view; the photo itself where the source has no other that can be read."""
         generator = rng(self._recipe.seed, epoch, index, "background")
         manifest = sources.manifests[choice.source]
         for _ in range(3):
@@ -195,7 +197,7 @@ class Worker:
             except (BadPhoto, BadShard):  # counted when its own turn comes
                 continue
         height, width = self._recipe.size
-        return cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA)
+        return cv2.resize(photo, (width + INPAINT_CONTEXT_PX, height), interpolation=cv2.INTER_AREA)
 
 
 def _image(photo: np.ndarray) -> Tensor:

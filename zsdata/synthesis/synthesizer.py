@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from zsdata.synthesis.confidence import flip_confidence, flip_consistency, normalize_inverse_depth
 from zsdata.synthesis.depth import DepthEstimator
 from zsdata.synthesis.disparity import SMALLEST_DISPARITY_PX, dilate_disparity, sharpen_disparity
 from zsdata.synthesis.view import View, view_map
-from zsdata.synthesis.warp import Warped, forward_warp
+from zsdata.synthesis.warp import forward_warp
 
 
 class DepthMaps(NamedTuple):
@@ -29,13 +30,22 @@ class DepthMaps(NamedTuple):
     consistency: Tensor
 
 
+INPAINT_CONTEXT_PX = 32  # a hole at the crop's right edge is filled from its background, which begins beyond that edge
+
+
 class Synthesized(NamedTuple):
-    """A pair before inpainting; all of the crop's size. The fields are those of `StereoBatch` and `Warped`."""
+    """A pair before inpainting. The left view has the crop's size; the right view reaches INPAINT_CONTEXT_PX columns beyond its right edge.
+
+    The fields are those of `StereoBatch` and `Warped`.
+    """
 
     left: Tensor
     disparity: Tensor
     confidence: Tensor
-    warped: Warped
+    nonocclusion_mask: Tensor
+    right: Tensor
+    inpaint_mask: Tensor
+    right_disparity: Tensor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,8 +94,15 @@ def synthesize(
     warped = forward_warp(photo_view, disparity)
 
     width = view.width - view.margin
+    missing = max(0, INPAINT_CONTEXT_PX - view.margin)  # the photo ends there: nothing is known of it
     return Synthesized(
-        photo_view[..., :width], disparity[..., :width], confidence[..., :width], Warped(*(field[..., :width] for field in warped))
+        left=photo_view[..., :width],
+        disparity=disparity[..., :width],
+        confidence=confidence[..., :width],
+        nonocclusion_mask=warped.nonocclusion_mask[..., :width],
+        right=F.pad(warped.right[..., : width + INPAINT_CONTEXT_PX], (0, missing)),
+        inpaint_mask=F.pad(warped.inpaint_mask[..., : width + INPAINT_CONTEXT_PX], (0, missing), value=True),
+        right_disparity=F.pad(warped.right_disparity[..., : width + INPAINT_CONTEXT_PX], (0, missing)),
     )
 
 
