@@ -1,5 +1,8 @@
 import json
+import time
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from accelerate import Accelerator
@@ -194,3 +197,19 @@ def test_a_batch_is_what_the_table_says(tar):
     left, right, disparity, confidence, masks = batch
     assert left.shape == right.shape == (2, 3, 64, 96)
     assert disparity.shape == confidence.shape == masks.inpaint.shape == (2, 1, 64, 96)
+
+
+def test_workers_start_after_opencv_has_used_its_own_threads(tar):
+    """A forked child inherits OpenCV's thread pool without the threads, and would wait for them for ever."""
+    image = np.zeros((2000, 2000), np.float32)
+    threads = cv2.getNumThreads()
+    try:
+        cv2.setNumThreads(2)
+        for _ in range(3):
+            cv2.resize(image, (3000, 3000), interpolation=cv2.INTER_CUBIC)
+        time.sleep(0.5)  # the pool goes to sleep
+        with open_stream(tar).loader(4, num_workers=2) as loader:
+            assert len(list(loader)) == 3
+        assert cv2.getNumThreads() == 2
+    finally:
+        cv2.setNumThreads(threads)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -208,6 +209,28 @@ def _image(photo: np.ndarray) -> Tensor:
 def _to_uint8(image: Tensor) -> Tensor:
     """float [1, 3, H, W] 0..255 to uint8 [3, H, W], rounded."""
     return (image[0] + 0.5).to(torch.uint8).contiguous()
+
+
+class _OpenCVAcrossFork:
+    """Puts OpenCV's threads to rest while a process forks.
+
+    A child inherits the pool without its threads, and hangs as soon as OpenCV uses or ends it. Without a pool there is nothing to wait for:
+    the parent starts a new one when it needs it, and the child, a worker, keeps to one thread.
+    """
+
+    def __init__(self) -> None:
+        self._threads = 1
+
+    def before(self) -> None:
+        self._threads = cv2.getNumThreads()
+        cv2.setNumThreads(1)
+
+    def after_in_parent(self) -> None:
+        cv2.setNumThreads(self._threads)
+
+
+_opencv_across_fork = _OpenCVAcrossFork()
+os.register_at_fork(before=_opencv_across_fork.before, after_in_parent=_opencv_across_fork.after_in_parent)
 
 
 @contextmanager
