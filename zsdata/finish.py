@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import torch
@@ -11,7 +12,7 @@ from zsdata.meter import Meter
 from zsdata.sample import Masks, StereoBatch
 from zsdata.seeding import rng
 from zsdata.synthesis.inpaint import Inpainter, fill
-from zsdata.worker import Prepared
+from zsdata.worker import Prepared, single_thread
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,13 @@ class Finisher:
 
     @torch.no_grad()
     def __call__(self, prepared: Prepared, meter: Meter) -> StereoBatch:
-        """A batch of prepared samples (with a batch axis) to a StereoBatch on the device; its images and labels are new tensors."""
+        """A batch of prepared samples (with a batch axis) to a StereoBatch on the device; its images and labels are new tensors.
+
+        On the CPU one thread does it: the workers have the others, and no sum depends on how many there are."""
+        with single_thread() if self.device.type == "cpu" else nullcontext():
+            return self._finish(prepared, meter)
+
+    def _finish(self, prepared: Prepared, meter: Meter) -> StereoBatch:
         with meter.stage("transfer"):
             left, right, disparity, confidence, nonocclusion, inpaint = (
                 tensor.to(self.device, non_blocking=True)

@@ -28,7 +28,7 @@ from zsdata.synthesis.disparity import AdaptiveDisparity, UniformDisparity
 from zsdata.synthesis.inpaint import Inpainter, load_inpainter
 from zsdata.synthesis.synthesizer import SynthesisConfig
 from zsdata.synthesis.view import ViewConfig
-from zsdata.worker import Prepared, Recipe, Worker, single_thread
+from zsdata.worker import Prepared, Recipe, Worker
 
 logger = logging.getLogger("zsdata")
 
@@ -230,8 +230,7 @@ class ZeroStereoStream(IterableDataset):
     def _finish(self, prepared: Prepared) -> StereoBatch:
         if self._cpu_finisher is None:
             self._cpu_finisher = self._finisher(torch.device("cpu"), micro_batch=1)
-        with single_thread():
-            return self._cpu_finisher(Prepared.stack([prepared]), self._meter)[0]
+        return self._cpu_finisher(Prepared.stack([prepared]), self._meter)[0]
 
     def _finisher(self, device: torch.device, micro_batch: int) -> Finisher:
         return Finisher(load_inpainter(self._inpaint, device), self._augmentation, micro_batch, device)
