@@ -17,6 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+CACHED_PX = 65_536  # warped at once on the CPU: what is between the steps stays in its cache, at half the time of the whole photo
 LARGEST_STEP_PX = 1.0  # neighbours whose disparities differ by more are two surfaces
 
 
@@ -55,7 +56,16 @@ def forward_warp(left: Tensor, disparity: Tensor) -> Warped:
             f"it takes left [B, C, H, W] and disparity [B, 1, H, W] of one size, got {list(left.shape)} and {list(disparity.shape)}"
         )
     batch, _, height, width = left.shape
-    rows = disparity.detach().float().reshape(batch * height, width)
+    rows = height if left.device.type != "cpu" else max(1, CACHED_PX // max(1, batch * width))
+    limits = left.amin((1, 2, 3), keepdim=True), left.amax((1, 2, 3), keepdim=True)  # cubic convolution overshoots
+    bands = zip(left.split(rows, 2), disparity.detach().float().split(rows, 2), strict=True)
+    return Warped(*(torch.cat(parts, 2) for parts in zip(*(_warp_band(*band, limits) for band in bands), strict=True)))
+
+
+def _warp_band(left: Tensor, disparity: Tensor, limits: tuple[Tensor, Tensor]) -> Warped:
+    """Some rows of the photo, kept within the range of the whole; no row depends on another."""
+    batch, _, height, width = left.shape
+    rows = disparity.reshape(batch * height, width)
 
     joined = (rows[:, 1:] - rows[:, :-1]).abs() <= LARGEST_STEP_PX
     winner = _nearest_source(rows, joined)
@@ -75,7 +85,8 @@ def forward_warp(left: Tensor, disparity: Tensor) -> Warped:
     share = gap / (1 + near_first - near_second).clamp_(min=torch.finfo(gap.dtype).tiny)
     right_disparity = torch.lerp(near_first, near_second, share).masked_fill_(hole, 0)
 
-    right = _resample_rows(left, first, second, share, joined).masked_fill_(hole.reshape(batch, 1, height, width), 0)
+    right = torch.minimum(torch.maximum(_resample_rows(left, first, second, share, joined), limits[0]), limits[1])
+    right = right.masked_fill_(hole.reshape(batch, 1, height, width), 0)
     seen = _wins_where_it_lands(rows, right_disparity, hole)
     shape = (batch, 1, height, width)
     return Warped(right, hole.reshape(shape), seen.reshape(shape), right_disparity.reshape(shape))
@@ -137,8 +148,7 @@ def _resample_rows(left: Tensor, first: Tensor, second: Tensor, share: Tensor, j
         back, on = back - ends_before * step, on + ends_after * step  # past the end of a surface its colour goes on straight
         curve = 2 * back - 5 * here + 4 * there - on  # Horner's form: equal colours give exactly that colour
         planes.append(here + 0.5 * t * (there - back + t * (curve + t * (3 * (here - there) + on - back))))
-    low, high = left.amin((1, 2, 3), keepdim=True), left.amax((1, 2, 3), keepdim=True)
-    return torch.stack(planes, 1).clamp(low, high)
+    return torch.stack(planes, 1)
 
 
 def _wins_where_it_lands(rows: Tensor, right_disparity: Tensor, hole: Tensor) -> Tensor:
