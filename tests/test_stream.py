@@ -142,6 +142,11 @@ def test_weighted_sources_are_mixed_by_their_weights(tmp_path):
     assert (sources.count("a"), sources.count("b")) == (12, 4)
 
 
+def test_weights_without_an_epoch_size_are_said_to_change_nothing(tar, caplog):
+    stream = open_stream({"a": ImageSource(tar, weight=0.7)})
+    assert len(stream) == 12 and "weights change nothing" in caplog.text
+
+
 def test_a_schedule_swaps_sources_between_epochs(tmp_path):
     first, second = photo_tar(tmp_path / "a.tar", 3), photo_tar(tmp_path / "b.tar", 4, first_seed=50)
     stream = open_stream({0: first, 2: {"late": second}})

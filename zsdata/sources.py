@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
@@ -12,6 +13,8 @@ from typing import Any
 
 from zsdata.plan import EpochPlan, quotas_for
 from zsdata.source.manifest import Manifest, build_manifest
+
+logger = logging.getLogger("zsdata")
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,10 @@ class Schedule:
         named = _by_name(sources)
         manifests = tuple(self._manifest(source.urls) for source in named.values())
         sizes = tuple(len(manifest) for manifest in manifests)
+        if self._epoch_size is None and any(source.weight is not None for source in named.values()):
+            logger.warning(
+                "without epoch_size an epoch is one pass over all photos and the sources' weights change nothing; set epoch_size"
+            )
         quotas = quotas_for(sizes, [source.weight for source in named.values()], self._epoch_size)
         return SourceSet(tuple(named), manifests, EpochPlan(self._seed, tuple(named), sizes, quotas))
 
