@@ -87,9 +87,7 @@ class Schedule:
         manifests = tuple(self._manifest(source.urls) for source in named.values())
         sizes = tuple(len(manifest) for manifest in manifests)
         if self._epoch_size is None and any(source.weight is not None for source in named.values()):
-            logger.warning(
-                "without epoch_size an epoch is one pass over the photos and the sources' weights change nothing; set it"
-            )
+            logger.warning("without epoch_size an epoch is one pass over the photos and the sources' weights change nothing; set it")
         quotas = quotas_for(sizes, [source.weight for source in named.values()], self._epoch_size)
         return SourceSet(tuple(named), manifests, EpochPlan(self._seed, tuple(named), sizes, quotas))
 
