@@ -326,3 +326,20 @@ def test_problems_of_the_shards_are_said_and_counted(tmp_path, caplog):
         stream = open_stream(tar)
     assert sum(stream.stats()["shard_problems"].values()) == 1
     assert "1 faults in the shards" in caplog.text
+
+
+def test_problems_of_swapped_shards_are_said_and_counted_too(tar, tmp_path, caplog):
+    other = write_tar(tmp_path / "b.tar", {"a.jpg": jpeg(photo(1)), "b.tif": b"II*\0"})
+    stream = open_stream(tar)
+    with stream.loader(1) as loader:
+        with caplog.at_level(logging.WARNING, logger="zsdata"):
+            stream.set_sources(other, epoch=1)
+        assert "1 faults in the shards" in caplog.text
+        assert sum(stream.stats()["shard_problems"].values()) == sum(loader.stats()["shard_problems"].values()) == 1
+
+
+def test_a_pair_says_which_photos_it_stands_in_for_in_any_process(tmp_path):
+    tar = write_tar(tmp_path / "mixed.tar", {**{f"{i}.jpg": jpeg(photo(i)) for i in range(3)}, "page.jpg": b"<html>" * 20})
+    pairs = list(DataLoader(open_stream(tar), batch_size=None, num_workers=1))
+    replaced = [key for pair in pairs for _, _, key, _ in pair.meta["replaced"]]
+    assert len(pairs) == 4 and set(replaced) == {"page"}

@@ -7,7 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from trainers.loop import TrainConfig
+from trainers.loop import LossFunction, TrainConfig, train
+from trainers.models import Matcher, load_checkpoint
 from trainers.pairs_on_disk import StereoPair, find_pairs, motorcycle, read_pair
 from trainers.ranks import start_missing_ranks
 from zsdata import AdaptiveDisparity, AugmentConfig, ImageSource, SynthesisConfig, UniformDisparity, ZeroStereoStream
@@ -137,6 +138,25 @@ def evaluation_pairs(arguments: argparse.Namespace) -> list[StereoPair]:
     for what in arguments.evaluate:
         pairs += [motorcycle()] if what == "motorcycle" else [read_pair(folder) for folder in find_pairs(Path(what))]
     return pairs
+
+
+def train_as_told(arguments: argparse.Namespace, matcher: Matcher, loss_function: LossFunction, name: str, options: dict[str, Any]) -> None:
+    """Trains a fresh `matcher`, called `name` and built with `options`, as the command line says."""
+    matcher.freeze_bn()
+    if arguments.initial_weights is not None:
+        load_checkpoint(matcher, arguments.initial_weights)
+    train(
+        matcher,
+        loss_function,
+        open_stream(arguments),
+        train_config(arguments),
+        output=arguments.output,
+        model_config={"model": name, "options": options},
+        arguments={argument: str(value) for argument, value in vars(arguments).items()},
+        resume=arguments.resume,
+        pairs=evaluation_pairs(arguments),
+        tracker=None if arguments.tracker == "none" else arguments.tracker,
+    )
 
 
 def run(main: Any) -> None:

@@ -14,9 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from trainers.arguments import add_training_arguments, evaluation_pairs, open_stream, run, train_config
-from trainers.loop import train
-from trainers.models import load_checkpoint
+from trainers.arguments import add_training_arguments, run, train_as_told
 from trainers.models.igev_stereo import IGEVStereo
 from trainers.models.mobilenet import load_imagenet_weights
 from zsdata import StereoBatch, zero_stereo_loss
@@ -69,23 +67,10 @@ def main() -> None:
     options = {name: getattr(arguments, name) for name in names}
     torch.manual_seed(arguments.seed)  # the fresh weights
     matcher = IGEVStereo(**options)
-    matcher.freeze_bn()
     if arguments.backbone_weights is not None:
         load_imagenet_weights(matcher.feature, arguments.backbone_weights)
-    if arguments.initial_weights is not None:
-        load_checkpoint(matcher, arguments.initial_weights)
-    train(
-        matcher,
-        partial(sequence_loss, max_disparity=arguments.max_supervised_disparity),
-        open_stream(arguments),
-        train_config(arguments),
-        output=arguments.output,
-        model_config={"model": "igev_stereo", "options": options},
-        arguments={name: str(value) for name, value in vars(arguments).items()},
-        resume=arguments.resume,
-        pairs=evaluation_pairs(arguments),
-        tracker=None if arguments.tracker == "none" else arguments.tracker,
-    )
+    loss = partial(sequence_loss, max_disparity=arguments.max_supervised_disparity)
+    train_as_told(arguments, matcher, loss, "igev_stereo", options)
 
 
 if __name__ == "__main__":

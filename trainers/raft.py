@@ -12,9 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from trainers.arguments import add_training_arguments, evaluation_pairs, open_stream, run, train_config
-from trainers.loop import train
-from trainers.models import load_checkpoint, load_matcher
+from trainers.arguments import add_training_arguments, run, train_as_told
+from trainers.models import load_matcher
 from zsdata import StereoBatch, zero_stereo_loss
 
 
@@ -54,21 +53,7 @@ def main() -> None:
     options = {name: getattr(arguments, name) for name in names}
     torch.manual_seed(arguments.seed)  # the fresh weights
     matcher = load_matcher("raft_stereo", **options)
-    matcher.freeze_bn()
-    if arguments.initial_weights is not None:
-        load_checkpoint(matcher, arguments.initial_weights)
-    train(
-        matcher,
-        sequence_loss,
-        open_stream(arguments),
-        train_config(arguments),
-        output=arguments.output,
-        model_config={"model": "raft_stereo", "options": options},
-        arguments={name: str(value) for name, value in vars(arguments).items()},
-        resume=arguments.resume,
-        pairs=evaluation_pairs(arguments),
-        tracker=None if arguments.tracker == "none" else arguments.tracker,
-    )
+    train_as_told(arguments, matcher, sequence_loss, "raft_stereo", options)
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ class StereoLoader:
         revision: Callable[[], int],
         epoch_size: Callable[[int], int],
         budget: FailureBudget,
-        problems: Mapping[str, int],
+        problems: Callable[[], Mapping[str, int]],
         batch_size: int,
         num_workers: int,
         rank: int,
@@ -70,7 +70,7 @@ class StereoLoader:
         self._samples = 0
         self._pipeline: _Pipeline | None = None
         self._faults = FaultLog(budget)
-        self._problems = dict(problems)
+        self._problems = problems
         self._meter = Meter()
         self._batches = 0
         # What Accelerate's gradient state reads of the loader that is being iterated.
@@ -144,7 +144,7 @@ class StereoLoader:
             "pairs": self._batches * self.batch_size,
             "rejected": dict(self._faults.by_reason),
             "examples": list(self._faults.examples),
-            "shard_problems": dict(self._problems),
+            "shard_problems": dict(self._problems()),
             "seconds": dict(self._meter.seconds),
         }
 

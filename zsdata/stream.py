@@ -84,15 +84,8 @@ class ZeroStereoStream(IterableDataset):
             raise ValueError(f"size is (height, width) in pixels, each {SMALLEST_CROP_PX} or more; got {size!r}")
         self._schedule = Schedule(sources, seed, epoch_size)
         self._revision = 0
-        self._problems = Counter(problem.reason.split(":")[0] for problem in self._schedule.problems)
-        if self._problems:
-            first = self._schedule.problems[0]
-            logger.warning(
-                "%d faults in the shards (%s), the first: %s; `zsdata verify` lists them",
-                self._problems.total(),
-                ", ".join(f"{reason}: {count}" for reason, count in self._problems.most_common()),
-                first,
-            )
+        self._told_problems = 0
+        self._tell_problems()
         self._inpaint = inpaint if callable(inpaint) else os.fspath(inpaint)
         self._augmentation = augmentation if augmentation is not None else AugmentConfig()
         self._budget = budget if budget is not None else FailureBudget()
@@ -153,6 +146,7 @@ class ZeroStereoStream(IterableDataset):
             raise ValueError(f"sources can be swapped from epoch 1 on; got {epoch}. For epoch 0 give them to the stream itself.")
         self._schedule.swap(epoch, sources)
         self._revision += 1
+        self._tell_problems()
 
     def replay(self, epoch: int, index: int) -> StereoBatch:
         """One sample again, just as training saw it: a finished pair on the CPU; `meta` says where it came from."""
@@ -190,7 +184,7 @@ class ZeroStereoStream(IterableDataset):
             revision=lambda: self._revision,
             epoch_size=self.epoch_size,
             budget=self._budget,
-            problems=self._problems,
+            problems=self._count_problems,
             batch_size=batch_size,
             num_workers=num_workers,
             rank=rank,
@@ -217,9 +211,26 @@ class ZeroStereoStream(IterableDataset):
             "pairs": self._faults.made,
             "rejected": dict(self._faults.by_reason),
             "examples": list(self._faults.examples),
-            "shard_problems": dict(self._problems),
+            "shard_problems": dict(self._count_problems()),
             "seconds": dict(self._meter.seconds),
         }
+
+    def _count_problems(self) -> Counter[str]:
+        """Faults of the shards themselves, by reason."""
+        return Counter(problem.reason.split(":")[0] for problem in self._schedule.problems)
+
+    def _tell_problems(self) -> None:
+        """Says what is wrong with shards that have been opened since the last time."""
+        new = self._schedule.problems[self._told_problems :]
+        self._told_problems += len(new)
+        if new:
+            reasons = Counter(problem.reason.split(":")[0] for problem in new)
+            logger.warning(
+                "%d faults in the shards (%s), the first: %s; `zsdata verify` lists them",
+                len(new),
+                ", ".join(f"{reason}: {count}" for reason, count in reasons.most_common()),
+                new[0],
+            )
 
     def _make(self, epoch: int, index: int) -> StereoBatch:
         prepared = self._worker.prepare(epoch, index)

@@ -169,6 +169,7 @@ class Worker:
             "disparity_scale": scale,
             "largest_disparity_px": float(made.disparity.max()),
             "flip_consistency": round(float(depth.consistency[0]), 6),
+            "replaced": [list(reject) for reject in rejected],  # photos that could not be used: source, shard, key, reason
             "hole_share": float(hole.count_nonzero()) / hole.numel(),
         }
         return Prepared(

@@ -38,7 +38,7 @@ def command(tmp_path, monkeypatch):
         return tmp_path / "run"
 
     tar = photo_tar(tmp_path / "photos.tar", 4)
-    monkeypatch.setattr(igev, "open_stream", open_stream)
+    monkeypatch.setattr("trainers.arguments.open_stream", open_stream)
     return run
 
 
