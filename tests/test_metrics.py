@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from zsdata.metrics import bad_pixel_rate, d1, end_point_error
+from zsdata.metrics import bad_pixel_rate, d1, disparity_edges, end_point_error
 
 
 def plain_metrics(prediction, disparity, valid, threshold):
@@ -73,3 +73,69 @@ def test_what_does_not_fit_is_named():
         bad_pixel_rate(disparity, disparity * math.inf, valid, 1)
     with pytest.raises(ValueError, match="threshold_px"):
         bad_pixel_rate(disparity, disparity, valid, 0)
+
+
+def plain_edges(disparity, valid, jump, reach, margin):
+    height, width = disparity.shape
+    edges = np.zeros((height, width), bool)
+
+    def mark(y, x):
+        for row in range(max(0, y - margin), min(height, y + margin + 1)):
+            for column in range(max(0, x - margin), min(width, x + margin + 1)):
+                edges[row, column] = True
+
+    for y in range(height):
+        for x in range(width):
+            if not valid[y, x]:
+                continue
+            for down, right in ((0, 1), (1, 0)):
+                for step in range(1, reach + 1):
+                    there = (y + step * down, x + step * right)
+                    if there[0] == height or there[1] == width:
+                        break
+                    if valid[there]:
+                        if abs(float(disparity[there]) - float(disparity[y, x])) > jump:
+                            mark(y, x)
+                            mark(*there)
+                        break
+    return edges
+
+
+@pytest.mark.parametrize("density", [1.0, 0.7, 0.25, 0.02])
+@pytest.mark.parametrize(("jump", "reach", "margin"), [(2.0, 4, 5), (1.0, 1, 0), (3.0, 30, 2)])
+def test_edges_are_those_of_plain_loops(density, jump, reach, margin):
+    rng = np.random.default_rng(1)
+    disparity = np.repeat(np.repeat(rng.uniform(1, 12, (3, 4)), 7, axis=0), 6, axis=1).astype(np.float32)
+    valid = rng.random(disparity.shape) < density
+    disparity[~valid] = rng.choice([0, np.inf, np.nan], (~valid).sum())
+    found = disparity_edges(torch.from_numpy(disparity), torch.from_numpy(valid), jump_px=jump, reach_px=reach, margin_px=margin)
+    np.testing.assert_array_equal(found.numpy(), plain_edges(disparity, valid, jump, reach, margin))
+
+
+def test_an_edge_is_as_wide_as_its_margin_and_a_slope_is_none():
+    step = torch.full((1, 1, 20, 40), 10.0)
+    step[..., 20:] = 12.5
+    everywhere = torch.ones_like(step, dtype=torch.bool)
+    edges = disparity_edges(step, everywhere)
+    assert edges.shape == step.shape and edges[..., 14:26].all() and edges.sum() == 12 * 20
+    slope = torch.arange(40.0).mul(1.9).expand(20, 40)
+    assert not disparity_edges(slope, everywhere[0, 0]).any()
+    hole = everywhere.clone()
+    hole[..., 17:23] = False  # wider than an edge can be told
+    assert not disparity_edges(step, hole).any()
+
+
+def test_edges_of_tiny_and_empty_maps():
+    assert not disparity_edges(torch.ones(1, 1), torch.ones(1, 1, dtype=torch.bool)).any()
+    assert not disparity_edges(torch.ones(5, 6), torch.zeros(5, 6, dtype=torch.bool)).any()
+
+
+def test_edges_of_what_does_not_fit_are_refused():
+    disparity, valid = torch.ones(2, 3), torch.ones(2, 3, dtype=torch.bool)
+    with pytest.raises(ValueError, match=r"\[2, 3\] and \[2, 2\]"):
+        disparity_edges(disparity, valid[:, 1:])
+    with pytest.raises(TypeError, match="float32"):
+        disparity_edges(disparity, disparity)
+    for wrong in ({"jump_px": 0}, {"reach_px": 0}, {"margin_px": -1}):
+        with pytest.raises(ValueError, match="jump_px is positive"):
+            disparity_edges(disparity, valid, **wrong)
