@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +25,21 @@ KEPT_CHECKPOINTS = 3
 
 def save(output: Path, step: int, matcher: nn.Module, config: dict[str, Any], training: dict[str, Any], state: dict[str, Any]) -> Path:
     """Writes the checkpoint of `step` as a whole or not at all; older ones but the last few are removed afterwards."""
+
+    def weights(folder: Path) -> None:
+        save_checkpoint(matcher, folder / "model.safetensors")
+        (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n")
+
+    return write(output, step, weights, training, state)
+
+
+def write(output: Path, step: int, weights: Callable[[Path], None], training: dict[str, Any], state: dict[str, Any]) -> Path:
+    """As `save`, for any network: `weights(folder)` writes its files."""
     folder = output / "checkpoints" / f"step-{step:08d}"
     unfinished = folder.with_name(f".{folder.name}.{os.getpid()}")
     unfinished.mkdir(parents=True)
     try:
-        save_checkpoint(matcher, unfinished / "model.safetensors")
-        (unfinished / "config.json").write_text(json.dumps(config, indent=2) + "\n")
+        weights(unfinished)
         torch.save(training, unfinished / "training.pt")
         (unfinished / "state.json").write_text(json.dumps({"step": step, **state}, indent=2) + "\n")
         if folder.exists():
