@@ -34,7 +34,7 @@ OTHER_IMAGE_EXTENSIONS = frozenset(  # of files that a user may take for photos 
         "raw",
     }
 )
-MAX_PHOTO_BYTES = 1 << 29  # 512 MiB; a 100-megapixel photo has 20 to 300 MB
+MAX_PHOTO_BYTES = 1 << 27  # 128 MiB; a 60-megapixel photo has 10 to 120 MB
 
 
 class PhotoMember(NamedTuple):

@@ -7,6 +7,8 @@ import numpy as np
 
 from zsdata.faults import BadPhoto
 
+BAND_PX = 1 << 20  # pixels blended at a time
+
 _RGB = getattr(cv2, "IMREAD_COLOR_RGB", None)  # OpenCV 4.11 and later
 
 
@@ -25,14 +27,24 @@ def decode_over_white(data: bytes, transparent_grey: int | None = None) -> np.nd
         transparent_grey: the value that a grey PNG declares transparent, at the depth it is decoded to.
     """
     image = _decode(data, cv2.IMREAD_UNCHANGED)  # which also leaves the orientation alone
+    if image.dtype not in (np.uint8, np.uint16) or (image.ndim == 3 and image.shape[2] not in (3, 4)):
+        raise BadPhoto(f"damaged: decodes to {image.dtype} {image.shape}")
+    height, width = image.shape[:2]
+    rgb = np.empty((height, width, 3), np.uint8)
+    rows = max(1, BAND_PX // width)  # at a time, as the steps between take several times the photo's bytes
+    for top in range(0, height, rows):
+        rgb[top : top + rows] = _over_white(image[top : top + rows], transparent_grey)
+    return rgb
+
+
+def _over_white(image: np.ndarray, transparent_grey: int | None) -> np.ndarray:
+    """Grey, BGR or BGRA of 8 or 16 bits to RGB of 8."""
     see_through = image == transparent_grey if transparent_grey is not None and image.ndim == 2 else None
     if image.dtype == np.uint16:
         image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)  # 65535 is 255 * 257
-    if image.dtype != np.uint8 or (image.ndim == 3 and image.shape[2] not in (3, 4)):
-        raise BadPhoto(f"damaged: decodes to {image.dtype} {image.shape}")
     if image.ndim == 2:
         if see_through is not None:
-            image[see_through] = 255
+            image = np.where(see_through, np.uint8(255), image)
         return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
     if image.shape[2] == 3:
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)

@@ -13,7 +13,8 @@ from zsdata.source.jpeg import Jpeg
 from zsdata.source.png import Png
 from zsdata.source.webp import WebP
 
-MAX_PIXELS = 100_000_000  # 300 MB of RGB; what any camera makes, and no bomb
+MAX_PIXELS = 100_000_000  # what a camera makes; larger ones take seconds to decode
+MAX_DECODE_BYTES = 400_000_000  # for one photo, all that its decoding holds at once; a 60-megapixel JPEG takes 360 MB
 MAX_SIDE = 65_535  # pixels; as JPEG has it
 
 _OTHERS = (  # at byte, signature, name
@@ -46,7 +47,8 @@ def decode_photo(data: bytes) -> Tensor:
     an animation gives its first frame. Colour profiles are not applied.
 
     Raises:
-        BadPhoto: another format, damaged or cut off (no part of such a photo is returned), or larger than MAX_PIXELS.
+        BadPhoto: another format, damaged or cut off (no part of such a photo is returned), or too large (MAX_PIXELS, MAX_SIDE,
+            MAX_DECODE_BYTES).
     """
     return torch.from_numpy(decode_rgb(data)).permute(2, 0, 1).contiguous()
 
@@ -88,6 +90,11 @@ def _open(data: bytes) -> Jpeg | Png | WebP:
         raise BadPhoto(f"damaged: {width} x {height} pixels")
     if max(width, height) > MAX_SIDE or width * height > MAX_PIXELS:
         raise BadPhoto(f"too large: {width:,} x {height:,} pixels, at most {MAX_PIXELS // 1_000_000} megapixels and {MAX_SIDE:,} a side")
+    needed = 3 * width * height + max(photo.working_bytes, 3 * width * height)  # a second RGB is held while it is turned or reordered
+    if needed > MAX_DECODE_BYTES:
+        raise BadPhoto(
+            f"too large: {width:,} x {height:,} pixels take {needed // 1_000_000} MB to decode, at most {MAX_DECODE_BYTES // 1_000_000}"
+        )
     return photo
 
 

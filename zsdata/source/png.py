@@ -14,6 +14,9 @@ from zsdata.source.opencv import decode_color, decode_over_white
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
+MAX_CHUNKS = 1_000_000  # real files have pixels in chunks of 8 KB and more
+
+_DECODED = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 _GREY, _GREY_ALPHA, _RGB_ALPHA = 0, 4, 6  # colour types
 
 
@@ -23,7 +26,7 @@ class Png:
 
     extension: ClassVar[str] = "png"
 
-    data: bytes
+    data: bytes  # without what a decoder does not need
     width: int
     height: int
     bits: int  # per channel
@@ -33,18 +36,22 @@ class Png:
 
     @staticmethod
     def parse(data: bytes) -> Png:
-        """Reads all chunks; of an animation it keeps the default image, which viewers that know no animation show."""
+        """Reads all chunks and keeps those that make the pixels: no text or profile is ever unpacked.
+
+        Of an animation that is the default image, which viewers that know no animation show.
+        """
         header, transparency, orientation = b"", None, 1
-        animated = has_pixels = False
-        still = [SIGNATURE]
-        kind, position = b"", len(SIGNATURE)
-        while kind != b"IEND":
+        has_pixels = False
+        needed: list[bytes | memoryview] = [SIGNATURE]
+        position = len(SIGNATURE)
+        view = memoryview(data)
+        for _ in range(MAX_CHUNKS):
             start = position + 8
             end = start + int.from_bytes(data[position : position + 4], "big")
             kind = data[position + 4 : start]
             if end + 4 > len(data):
                 raise BadPhoto("truncated: ends inside the PNG chunks")
-            if zlib.crc32(data[position + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            if zlib.crc32(view[position + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
                 raise BadPhoto(f"damaged: wrong checksum of the PNG chunk {kind.decode('latin-1')!r}")
             if kind == b"IHDR" and not header:
                 header = data[start:end]
@@ -52,15 +59,26 @@ class Png:
                 transparency = data[start:end]
             elif kind == b"eXIf":
                 orientation = read_orientation(data[start:end])
-            animated |= kind == b"acTL"
             has_pixels |= kind == b"IDAT"
             position = end + 4
-            if kind[:1].isupper() or kind == b"tRNS":  # what a decoder needs, without the further frames
-                still.append(data[start - 8 : position])
+            if kind in _DECODED:
+                needed.append(view[start - 8 : position])
+            elif kind[:1].isupper():
+                raise BadPhoto(f"damaged: an unknown PNG chunk {kind.decode('latin-1')!r}, and no decoder may pass it over")
+            if kind == b"IEND":
+                break
+        else:
+            raise BadPhoto(f"damaged: a PNG of more than {MAX_CHUNKS:,} chunks")
         if len(header) != 13 or not has_pixels:
             raise BadPhoto("damaged: a PNG without header or image data")
         width, height = int.from_bytes(header[:4], "big"), int.from_bytes(header[4:8], "big")
-        return Png(b"".join(still) if animated else data, width, height, header[8], header[9], transparency, orientation)
+        return Png(b"".join(needed), width, height, header[8], header[9], transparency, orientation)
+
+    @property
+    def working_bytes(self) -> int:
+        """What the decoder holds beside the result."""
+        channels = {_GREY_ALPHA: 4, _RGB_ALPHA: 4}.get(self.color_type, 3) + (self.transparency is not None)
+        return self.width * self.height * channels * (2 if self.bits == 16 else 1)
 
     def decode(self) -> np.ndarray:
         """uint8 [height, width, 3] RGB over white; 16 bits are rounded to 8."""

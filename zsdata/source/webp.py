@@ -11,6 +11,8 @@ from zsdata.faults import BadPhoto
 from zsdata.source.exif import read_orientation
 from zsdata.source.opencv import decode_color, decode_over_white
 
+MAX_CHUNKS = 1_000_000  # an animation has one for each frame
+
 _ANIMATED, _HAS_ALPHA = 0x02, 0x10  # flags of VP8X
 
 
@@ -20,7 +22,7 @@ class WebP:
 
     extension: ClassVar[str] = "webp"
 
-    still: bytes  # a WebP without animation
+    still: bytes  # a WebP of one picture, without what a decoder does not need
     width: int
     height: int
     may_have_alpha: bool
@@ -38,14 +40,14 @@ class WebP:
         orientation = read_orientation(chunks[b"EXIF"]) if b"EXIF" in chunks else 1
         extended = chunks.get(b"VP8X")
         if extended is None:
-            return WebP(data, *_bitstream_size(chunks), b"VP8L" in chunks, orientation)
+            return WebP(_still(chunks), *_bitstream_size(chunks), b"VP8L" in chunks, orientation)
         if len(extended) < 10:
             raise BadPhoto("damaged: no size in the WebP header")
         width, height = _uint24(extended, 4) + 1, _uint24(extended, 7) + 1
         if not extended[0] & _ANIMATED:
             if _bitstream_size(chunks) != (width, height):
                 raise BadPhoto("damaged: a WebP image of another size than its canvas")
-            return WebP(data, width, height, True, orientation)
+            return WebP(_still(chunks), width, height, True, orientation)
         frame = chunks.get(b"ANMF", b"")
         if len(frame) < 16:
             raise BadPhoto("damaged: an animated WebP without a frame")
@@ -55,6 +57,11 @@ class WebP:
         if left + frame_width > width or top + frame_height > height:
             raise BadPhoto("damaged: a WebP frame outside of its canvas")
         return WebP(_still(frame_chunks), width, height, True, orientation, left, top)
+
+    @property
+    def working_bytes(self) -> int:
+        """What the decoder holds beside the result: a lossless one its colours, and both an image with alpha."""
+        return self.width * self.height * (8 if self.may_have_alpha else 0)
 
     def decode(self) -> np.ndarray:
         """uint8 [height, width, 3] RGB over white."""
@@ -69,18 +76,22 @@ class WebP:
 def _chunks(data: bytes, position: int, end: int) -> dict[bytes, bytes]:
     """The first chunk of each kind."""
     chunks: dict[bytes, bytes] = {}
-    while position + 8 <= end:
+    for _ in range(MAX_CHUNKS):
+        if position + 8 > end:
+            return chunks
         kind, size = data[position : position + 4], int.from_bytes(data[position + 4 : position + 8], "little")
         if position + 8 + size > end:
             raise BadPhoto("truncated: ends inside the WebP chunks")
         chunks.setdefault(kind, data[position + 8 : position + 8 + size])
         position += 8 + size + size % 2
-    return chunks
+    raise BadPhoto(f"damaged: a WebP of more than {MAX_CHUNKS:,} chunks")
 
 
 def _bitstream_size(chunks: dict[bytes, bytes]) -> tuple[int, int]:
     """Width and height from the header of the compressed pixels."""
     lossless, lossy = chunks.get(b"VP8L"), chunks.get(b"VP8 ")
+    if lossless is not None and lossy is not None:
+        raise BadPhoto("damaged: a WebP with two pictures in one frame")
     if lossless is not None and len(lossless) >= 5 and lossless[0] == 0x2F:
         bits = int.from_bytes(lossless[1:5], "little")
         return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
