@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.oracles_scores import plain_edges
 from zsdata.metrics import bad_pixel_rate, d1, disparity_edges, end_point_error
 
 
@@ -73,32 +74,6 @@ def test_what_does_not_fit_is_named():
         bad_pixel_rate(disparity, disparity * math.inf, valid, 1)
     with pytest.raises(ValueError, match="threshold_px"):
         bad_pixel_rate(disparity, disparity, valid, 0)
-
-
-def plain_edges(disparity, valid, jump, reach, margin):
-    height, width = disparity.shape
-    edges = np.zeros((height, width), bool)
-
-    def mark(y, x):
-        for row in range(max(0, y - margin), min(height, y + margin + 1)):
-            for column in range(max(0, x - margin), min(width, x + margin + 1)):
-                edges[row, column] = True
-
-    for y in range(height):
-        for x in range(width):
-            if not valid[y, x]:
-                continue
-            for down, right in ((0, 1), (1, 0)):
-                for step in range(1, reach + 1):
-                    there = (y + step * down, x + step * right)
-                    if there[0] == height or there[1] == width:
-                        break
-                    if valid[there]:
-                        if abs(float(disparity[there]) - float(disparity[y, x])) > jump:
-                            mark(y, x)
-                            mark(*there)
-                        break
-    return edges
 
 
 @pytest.mark.parametrize("density", [1.0, 0.7, 0.25, 0.02])

@@ -1,16 +1,21 @@
-"""Judges a matcher on stereo pairs with ground truth.
+"""The zero-shot benchmark: judges a matcher on stereo pairs with ground truth.
 
-    python trainers/evaluate.py --model raft --checkpoint raftstereo-sceneflow.pth --dataset middlebury --root MiddEval3/trainingH
-    python trainers/evaluate.py --model raft --checkpoint runs/first/checkpoints/step-00200000 --dataset motorcycle --json scores.json
-    python trainers/evaluate.py --model sgbm --dataset folder --root pairs --pictures pictures
+    python trainers/evaluate.py --model raft --checkpoint raftstereo-sceneflow.pth --dataset middlebury --variant F --root MiddEval3
+    python trainers/evaluate.py --model igev --checkpoint runs/first/checkpoints/step-00200000 --dataset kitti2015 --root kitti/2015
+    python trainers/evaluate.py --model sgbm --dataset folder --root pairs --pictures pictures --json scores.json --csv scores.csv
+    python trainers/evaluate.py --model my_package.my_module:predict --dataset motorcycle
 
-Per pair and as a mean over the pairs: EPE, the mean absolute error in pixels; bad-N, the share of pixels that are off by more than N px;
-D1, the share that is off by more than 3 px and 5 %. "all" counts every pixel with ground truth, "noc" those that both cameras
-see, where the pair comes with a mask of them. A pair without such a pixel is left out of the mean.
+Scores of each pair, and their means over the pairs (each counts alike, as in the paper's tables) and over all pixels (as RAFT-Stereo
+averages the outliers of KITTI and Scene Flow): EPE, the mean absolute error in pixels; bad-N, the share of pixels that are off by more than
+N px; D1, the share that is off by more than 3 px and by more than 5 %.
 
---dataset folder: ROOT is a pair or holds one folder per pair, with left.*, right.* and disp.* (png, jpg, tif; disp also pfm); optional
-mask_left.png (255: visible in both views), and pair.json {"divisor": N} for what stored disparities are divided by.
-kitti2015, middlebury, eth3d, drivingstereo: the folder that the benchmark was unpacked into. motorcycle: ships with scikit-image.
+They are counted in regions. all: every pixel with ground truth. noc: those that both cameras see, where the pair comes with a mask of
+them. all_edges, noc_edges: those near a depth edge, that is at most 5 px (in rows and in columns) from a discontinuity: two known
+pixels of one row or column, at most 4 px apart with none known between them, whose true disparities differ by more than 2 px.
+all_below_N, noc_below_N: those with a true disparity below N (--below). A pair without such a pixel is left out of the mean.
+
+A model that is not ours: --model package.module:callable. It is called as callable(left, right), with unpadded RGB images, float32 [1, 3,
+H, W] in 0..255 on --device (or uint8 [H, W, 3] with --takes numpy), and returns the left view's disparity [H, W], positive pixels.
 """
 
 from __future__ import annotations
@@ -18,10 +23,9 @@ from __future__ import annotations
 import argparse
 import inspect
 import json
-import math
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,24 +35,17 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from trainers.benchmarks_on_disk import BENCHMARKS
-from trainers.models import MATCHERS, load_trained
-from trainers.pairs_on_disk import StereoPair, find_pairs, motorcycle, read_pair
-from trainers.sgbm import sgbm
-from zsdata.metrics import bad_pixel_rate, d1, end_point_error
+from trainers.benchmarks_on_disk import BENCHMARKS, find_benchmark
+from trainers.models import MATCHERS
+from trainers.pairs_on_disk import StereoPair, find_pairs, motorcycle, pair_files
+from trainers.predictors import MODELS, PRECISIONS, TAKES, find_predictor
+from trainers.scores import all_means, mean_scores, score, table, write_csv
+from trainers.strips import LEAST_ROWS, Predict
 
-Predict = Callable[[Tensor, Tensor], Tensor]
+__all__ = ["evaluate", "mean_scores", "table"]
 
-METRICS: dict[str, Callable[[Tensor, Tensor, Tensor], float]] = {
-    "epe": end_point_error,
-    "bad_1": lambda *maps: bad_pixel_rate(*maps, threshold_px=1),
-    "bad_2": lambda *maps: bad_pixel_rate(*maps, threshold_px=2),
-    "bad_3": lambda *maps: bad_pixel_rate(*maps, threshold_px=3),
-    "d1": d1,
-}
-REGIONS = ("all", "noc")
-MODELS = {name.removesuffix("_stereo"): name for name in MATCHERS}
 WORST_ERROR_PX = 10.0  # brightest in the error pictures
+OUT_OF_MEMORY = "--tile-rows 512 matches it in strips; --corr-implementation alt (RAFT-Stereo) and --mixed-precision bf16 take less"
 
 
 def evaluate(
@@ -58,6 +55,7 @@ def evaluate(
     device: torch.device | str = "cpu",
     pictures: Path | None = None,
     total: int | None = None,
+    below_px: Sequence[float] = (),
 ) -> list[dict[str, Any]]:
     """Scores of `predict` on each pair, with a progress bar.
 
@@ -67,59 +65,40 @@ def evaluate(
         pairs: read one by one.
         pictures: a folder for NAME_disparity.png and NAME_error.png.
         total: how many pairs, for the progress bar, where `pairs` does not know.
+        below_px: see `trainers.scores.score`.
     Returns:
-        For each pair {"name", "seconds", "all": scores, "noc": scores or None}, where scores are "pixels" (how many counted), "epe"
-        in pixels and "bad_1", "bad_2", "bad_3", "d1" as shares in 0..1, None without a pixel to count. `mean_scores` sums them up.
+        For each pair {"name", "group", "seconds"} and the scores by region of `trainers.scores.score`. `mean_scores` sums them up.
     Raises:
         ValueError: a prediction of another size or not finite; names the pair.
+        MemoryError: a pair does not fit; names it and what helps.
     """
     results = []
     for pair in tqdm(pairs, total=total, desc="evaluate", unit="pair"):
         left, right = (torch.from_numpy(image).to(device).permute(2, 0, 1)[None].float() for image in (pair.left, pair.right))
         begin = time.perf_counter()
-        prediction = predict(left, right).cpu()  # the copy waits for the device
+        prediction = _predict_or_say_what_helps(predict, left, right, pair.name)
         seconds = time.perf_counter() - begin
         if prediction.shape != (1, 1, *pair.disparity.shape):
             raise ValueError(f"{pair.name}: predicted {list(prediction.shape)} for images of {list(pair.disparity.shape)}")
         prediction = prediction[0, 0].float()
-        visible = {"all": pair.valid, "noc": None if pair.nonoccluded is None else pair.valid & pair.nonoccluded}
         try:
-            scores = {region: None if mask is None else _scores(prediction, pair.disparity, mask) for region, mask in visible.items()}
+            scores = score(prediction, pair, below_px)
         except ValueError as error:
             raise ValueError(f"{pair.name}: {error}") from error
-        results.append({"name": pair.name, "seconds": round(seconds, 4), **scores})
+        results.append({"name": pair.name, "group": pair.group, "seconds": round(seconds, 4), **scores})
         if pictures is not None:
             _paint(pictures, pair, prediction.numpy())
     return results
 
 
-def mean_scores(results: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """The mean over the pairs, each counting alike, for "all" and "noc"; "pairs" says how many had a pixel to count."""
-    means = {}
-    for region in REGIONS:
-        scored = [result[region] for result in results if result[region] is not None and result[region]["pixels"]]
-        means[region] = {"pairs": len(scored)} | {
-            name: math.fsum(scores[name] for scores in scored) / len(scored) if scored else None for name in METRICS
-        }
-    return means
-
-
-def table(results: list[dict[str, Any]]) -> str:
-    """The results and their means as text; shares in percent."""
-    rows = [(result["name"], region, result[region]) for result in results for region in REGIONS if result[region] is not None]
-    rows += [(f"mean of {mean['pairs']}", region, mean) for region, mean in mean_scores(results).items() if mean["pairs"]]
-    width = max(len(name) for name, _, _ in [("pair", "", {}), *rows])
-    lines = [f"{'pair':{width}}  region  EPE px  bad-1 %  bad-2 %  bad-3 %    D1 %"]
-    for name, region, scores in rows:
-        numbers = [f"{'-' if scores[key] is None else format(scores[key] * (1 if key == 'epe' else 100), '.2f'):>7}" for key in METRICS]
-        lines.append(f"{name:{width}}  {region:6}{numbers[0]}  " + "  ".join(numbers[1:]))
-    return "\n".join(lines)
-
-
-def _scores(prediction: Tensor, disparity: np.ndarray, mask: np.ndarray) -> dict[str, Any]:
-    maps = prediction, torch.from_numpy(disparity), torch.from_numpy(mask)
-    values = {name: metric(*maps) for name, metric in METRICS.items()}
-    return {"pixels": int(mask.sum())} | {name: None if math.isnan(value) else value for name, value in values.items()}
+def _predict_or_say_what_helps(predict: Predict, left: Tensor, right: Tensor, name: str) -> Tensor:
+    try:
+        return predict(left, right).cpu()  # the copy waits for the device
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, (MemoryError, torch.OutOfMemoryError)) and "allocate memory" not in str(error):
+            raise
+        size = f"{left.shape[-1]} x {left.shape[-2]} px"
+        raise MemoryError(f"{name}, {size}, does not fit into the memory of {left.device}: {OUT_OF_MEMORY}") from error
 
 
 def _paint(folder: Path, pair: StereoPair, prediction: np.ndarray) -> None:
@@ -135,28 +114,44 @@ def _paint(folder: Path, pair: StereoPair, prediction: np.ndarray) -> None:
         (folder / f"{pair.name}_{kind}.png").write_bytes(content.tobytes())
 
 
-def _pairs(dataset: str, root: Path | None) -> tuple[Iterator[StereoPair], int]:
-    """The pairs of a data set, read when their turn comes, and how many there are."""
+def open_dataset(dataset: str, root: Path | None = None, variant: str | None = None) -> tuple[Iterator[StereoPair], int]:
+    """The pairs of a data set, read when their turn comes, and how many there are.
+
+    Args:
+        dataset: "motorcycle", "folder" or a key of BENCHMARKS.
+        root: where it lies; not for the motorcycle.
+        variant: see `trainers.benchmarks_on_disk.find_benchmark`.
+    Raises:
+        FileNotFoundError, ValueError: it is not there, at once and not when its turn comes; says what was expected where.
+    """
+    if variant is not None and dataset not in BENCHMARKS:
+        raise ValueError(f"--dataset {dataset} has no variants; leave out --variant")
     if dataset == "motorcycle":
         return iter([motorcycle()]), 1
     if root is None:
         raise ValueError(f"--dataset {dataset} needs --root DIR")
-    if dataset == "folder":
-        folders = find_pairs(root)
-        return (read_pair(folder) for folder in folders), len(folders)
-    files = BENCHMARKS[dataset](root)
+    files = [pair_files(folder) for folder in find_pairs(root)] if dataset == "folder" else find_benchmark(dataset, root, variant)
     return (pair.read() for pair in files), len(files)
 
 
-def _predictor(arguments: argparse.Namespace, options: dict[str, Any]) -> Predict:
-    if arguments.model == "sgbm":
-        if arguments.checkpoint is not None or options:
-            raise ValueError("--model sgbm has no weights: leave out --checkpoint and the matcher's options")
-        return sgbm
-    if arguments.checkpoint is None:
-        raise ValueError(f"--model {arguments.model} needs --checkpoint FILE or DIR")
-    matcher = load_trained(arguments.checkpoint, MODELS[arguments.model], **options).to(arguments.device)
-    return lambda left, right: matcher.predict(left, right, iterations=arguments.iterations)
+def _report(arguments: argparse.Namespace, options: dict[str, Any], results: list[dict[str, Any]]) -> dict[str, Any]:
+    network = arguments.model in MODELS
+    benchmark = BENCHMARKS.get(arguments.dataset)
+    return {
+        "model": arguments.model,
+        "checkpoint": None if arguments.checkpoint is None else str(arguments.checkpoint),
+        "options": options,
+        "iterations": arguments.iterations if network else None,
+        "mixed_precision": arguments.mixed_precision,
+        "tile_rows": arguments.tile_rows,
+        "dataset": arguments.dataset,
+        "variant": arguments.variant or (benchmark.variants[0] if benchmark and benchmark.variants else None),
+        "complete": benchmark is None or len(results) >= benchmark.pairs,
+        "units": {"epe": "px", "bad_N, d1": "share in 0..1"},
+        "mean": mean_scores(results),
+        "means": all_means(results),
+        "pairs": results,
+    }
 
 
 def _matcher_options() -> dict[str, dict[str, Any]]:
@@ -168,20 +163,54 @@ def _matcher_options() -> dict[str, dict[str, Any]]:
     return options
 
 
+def _data_sets() -> str:
+    """What --root is to hold, for the help."""
+    lines = ["data sets (with their variants, the first one unless --variant says otherwise), and what --root is to hold:"]
+    for name, benchmark in BENCHMARKS.items():
+        variants = f" ({', '.join(benchmark.variants)})" if benchmark.variants else ""
+        lines.append(f"  {name}{variants}: {benchmark.layout}")
+    lines += [
+        "  folder: a pair, or one folder per pair, with left.*, right.* (png, jpg, tif) and disp.* (pfm, png, tif, npy, npz); optional",
+        '      mask_left.png (255: visible in both views), and pair.json {"divisor": N} for what stored disparities are divided by;',
+        "      0, negative, infinite and NaN are no value",
+        "  motorcycle: comes with scikit-image, no --root",
+    ]
+    return "\n".join(lines)
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--model", required=True, choices=[*MODELS, "sgbm"], help="sgbm: OpenCV's classical matcher, for comparison")
+    parser = argparse.ArgumentParser(description=__doc__, epilog=_data_sets(), formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--model",
+        required=True,
+        metavar="MODEL",
+        help=f"{', '.join(MODELS)}, sgbm (OpenCV's classical matcher), or package.module:callable",
+    )
     parser.add_argument(
         "--checkpoint", type=Path, metavar="PATH", help="published .pth or .safetensors file, or a trainer's folder with config.json"
     )
-    parser.add_argument("--dataset", required=True, choices=["folder", "motorcycle", *BENCHMARKS], help="see above")
+    parser.add_argument("--dataset", required=True, choices=["folder", "motorcycle", *BENCHMARKS], help="see below")
     parser.add_argument("--root", type=Path, metavar="DIR", help="where the data set lies")
+    parser.add_argument("--variant", metavar="NAME", help="a resolution (F, H, Q) or render pass (finalpass, cleanpass), see below")
+    parser.add_argument(
+        "--below",
+        type=float,
+        nargs="+",
+        metavar="PX",
+        help="also the scores of the points whose true disparity is smaller, such as 192 (default: 192 on sceneflow, as published)",
+    )
     parser.add_argument("--json", type=Path, metavar="OUT", help="write all scores to this file")
+    parser.add_argument("--csv", type=Path, metavar="OUT", help="write all scores to this file, a line for each pair and region")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="write NAME_disparity.png and NAME_error.png into this folder")
     parser.add_argument("--iterations", type=int, default=32, help="updates of the matcher (default: 32)")
     parser.add_argument(
         "--device", default="cuda" if torch.cuda.is_available() else "cpu", help='"cpu", "cuda", "cuda:1" (default: cuda if there is one)'
     )
+    parser.add_argument("--mixed-precision", choices=list(PRECISIONS), default="no", help="runs the network under autocast (default: no)")
+    parser.add_argument(
+        "--tile-rows", type=int, metavar="N", help=f"match in overlapping strips of N rows, at least {LEAST_ROWS}, where memory is short"
+    )
+    parser.add_argument("--takes", choices=TAKES, default="torch", help="what a callable of yours takes (default: torch)")
     group = parser.add_argument_group("the matcher's options, as it was trained (default: as published, or as config.json says)")
     for name, defaults in _matcher_options().items():
         flag, default = f"--{name.replace('_', '-')}", next(iter(defaults.values()))
@@ -199,27 +228,34 @@ def main() -> None:
     arguments = _parser().parse_args()
     given = {name: getattr(arguments, name) for name in _matcher_options()}
     options = {name: value for name, value in given.items() if value is not None}
-    predict = _predictor(arguments, options)
-    pairs, total = _pairs(arguments.dataset, arguments.root)
-    results = evaluate(predict, pairs, device=arguments.device, pictures=arguments.pictures, total=total)
+    predict = find_predictor(
+        arguments.model,
+        checkpoint=arguments.checkpoint,
+        options=options,
+        iterations=arguments.iterations,
+        device=arguments.device,
+        mixed_precision=arguments.mixed_precision,
+        takes=arguments.takes,
+        tile_rows=arguments.tile_rows,
+    )
+    pairs, total = open_dataset(arguments.dataset, arguments.root, arguments.variant)
+    benchmark = BENCHMARKS.get(arguments.dataset)
+    if benchmark is not None and total < benchmark.pairs:
+        print(f"only {total} of the {benchmark.pairs} pairs of {arguments.dataset} are there: not the benchmark's score", file=sys.stderr)
+    below = arguments.below or (benchmark.below_px if benchmark else ())
+    for path in (arguments.json, arguments.csv):
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+    results = evaluate(predict, pairs, device=arguments.device, pictures=arguments.pictures, total=total, below_px=below)
     print(table(results))
     if arguments.json is not None:
-        report = {
-            "model": arguments.model,
-            "checkpoint": None if arguments.checkpoint is None else str(arguments.checkpoint),
-            "options": options,
-            "iterations": None if arguments.model == "sgbm" else arguments.iterations,
-            "dataset": arguments.dataset,
-            "units": {"epe": "px", "bad_1, bad_2, bad_3, d1": "share in 0..1"},
-            "mean": mean_scores(results),
-            "pairs": results,
-        }
-        arguments.json.parent.mkdir(parents=True, exist_ok=True)
-        arguments.json.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n")
+        arguments.json.write_text(json.dumps(_report(arguments, options, results), indent=2, allow_nan=False) + "\n")
+    if arguments.csv is not None:
+        write_csv(arguments.csv, results)
 
 
 if __name__ == "__main__":
     try:
         main()
-    except (ImportError, OSError, TypeError, ValueError) as error:
+    except (ImportError, MemoryError, OSError, TypeError, ValueError) as error:
         sys.exit(f"evaluate.py: {error}")

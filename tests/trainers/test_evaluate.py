@@ -11,13 +11,18 @@ import numpy as np
 import pytest
 import torch
 
+from tests.oracles_scores import plain_edges, plain_scores
+from tests.scenes import SHARED
+from tests.trainers.benchmark_folders import write_benchmark
 from trainers import evaluate as command
-from trainers.evaluate import evaluate, mean_scores, table
+from trainers.benchmarks_on_disk import BENCHMARKS
+from trainers.evaluate import evaluate
 from trainers.models import load_matcher, load_trained, save_checkpoint
 from trainers.pairs_on_disk import StereoPair, motorcycle
 from trainers.sgbm import sgbm
 
 REPOSITORY = Path(__file__).resolve().parents[2]
+SHARED_PAIRS = SHARED / "data" / "stereo"
 SMALL = {"hidden_dims": (16, 16, 16), "corr_levels": 2, "corr_radius": 2}
 
 
@@ -49,34 +54,29 @@ def test_scores_are_those_of_all_and_of_visible_pixels():
     assert left.dtype == torch.float32 and left.shape == (1, 3, 40, 96)
     assert torch.equal(left[0], torch.from_numpy(pair.left).permute(2, 0, 1).float())
     assert torch.equal(right[0], torch.from_numpy(pair.right).permute(2, 0, 1).float())
-    share = 6 / 96
+    truth, everywhere = pair.disparity, np.ones((40, 96), bool)
+    prediction = np.where(np.arange(96) < 6, 16.0, 7.5) * np.ones((40, 1))
     assert result["name"] == "wall" and result["seconds"] >= 0
-    assert result["all"] == pytest.approx(
-        {"pixels": 40 * 96, "epe": 1.5 + share * 8.5, "bad_1": 1.0, "bad_2": share, "bad_3": share, "d1": share}
-    )
-    assert result["noc"] == {"pixels": 40 * 90, "epe": 1.5, "bad_1": 1.0, "bad_2": 0.0, "bad_3": 0.0, "d1": 0.0}
+    assert result["all"] == pytest.approx(plain_scores(prediction, truth, everywhere))
+    assert result["noc"] == pytest.approx(plain_scores(prediction, truth, pair.nonoccluded))
+    assert result["noc"]["epe"] == 1.5 and result["noc"]["bad_2"] == 0
 
 
-def test_the_mean_is_over_pairs_and_leaves_out_those_without_a_pixel():
-    small, large = textured_pair("small", 6, (8, 16)), textured_pair("large", 10, (40, 96))
-    empty = small._replace(name="empty", valid=np.zeros((8, 16), bool))
-    unmasked = large._replace(name="unmasked", nonoccluded=None)
-    results = evaluate(constant(7.0), [small, large, empty, unmasked])
-    means = mean_scores(results)
-    assert means["all"]["pairs"] == 3 and means["all"]["epe"] == pytest.approx((1 + 3 + 3) / 3)
-    assert means["noc"]["pairs"] == 2 and means["noc"]["epe"] == pytest.approx(2.0)
-    assert results[2]["all"] == {"pixels": 0, "epe": None, "bad_1": None, "bad_2": None, "bad_3": None, "d1": None}
-    json.dumps(results, allow_nan=False)
-    nothing = mean_scores(results[2:3])
-    assert nothing["all"] == {"pairs": 0, "epe": None, "bad_1": None, "bad_2": None, "bad_3": None, "d1": None}
+def test_a_pair_that_does_not_fit_is_told_what_helps():
+    def full(left, right):
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 42 GiB")
 
+    def host_is_full(left, right):
+        raise RuntimeError("[enforce fail at alloc_cpu.cpp:127] . DefaultCPUAllocator: can't allocate memory: you tried to allocate 42")
 
-def test_the_table_shows_pixels_and_percent():
-    results = evaluate(constant(9.5), [textured_pair()])
-    lines = [line.split() for line in table(results).splitlines()]
-    assert lines[1] == ["wall", "all", "3.50", "100.00", "100.00", "100.00", "100.00"]
-    assert lines[-1][:5] == ["mean", "of", "1", "noc", "3.50"]
-    assert "-" in table(evaluate(constant(9.5), [textured_pair()._replace(valid=np.zeros((40, 96), bool))]))
+    def broken(left, right):
+        raise RuntimeError("expected scalar type Half but found Float")
+
+    for predict in (full, host_is_full):
+        with pytest.raises(MemoryError, match=r"wall, 96 x 40 px, does not fit into the memory of cpu: --tile-rows 512 .*alt.*bf16"):
+            evaluate(predict, [textured_pair()])
+    with pytest.raises(RuntimeError, match="expected scalar type"):
+        evaluate(broken, [textured_pair()])
 
 
 def test_pictures_show_the_disparity_and_the_error(tmp_path):
@@ -172,18 +172,80 @@ def test_sgbm_and_the_motorcycle_need_no_files(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "error", "message"),
+    ("arguments", "message"),
     [
-        (["--model", "raft", "--dataset", "motorcycle"], ValueError, "--model raft needs --checkpoint"),
-        (["--model", "sgbm", "--dataset", "folder"], ValueError, "--dataset folder needs --root"),
-        (["--model", "sgbm", "--dataset", "eth3d"], ValueError, "--dataset eth3d needs --root"),
-        (["--model", "sgbm", "--dataset", "motorcycle", "--checkpoint", "x"], ValueError, "sgbm has no weights"),
-        (["--model", "sgbm", "--dataset", "motorcycle", "--corr-levels", "2"], ValueError, "sgbm has no weights"),
+        (["--model", "raft", "--dataset", "motorcycle"], "--model raft needs --checkpoint"),
+        (["--model", "sgbm", "--dataset", "folder"], "--dataset folder needs --root"),
+        (["--model", "sgbm", "--dataset", "eth3d"], "--dataset eth3d needs --root"),
+        (["--model", "sgbm", "--dataset", "motorcycle", "--checkpoint", "x"], "sgbm has no weights"),
+        (["--model", "sgbm", "--dataset", "motorcycle", "--variant", "H"], "motorcycle has no variants"),
+        (["--model", "sgbm", "--dataset", "motorcycle", "--tile-rows", "8"], "at least 256 rows high; got 8"),
     ],
 )
-def test_arguments_that_do_not_fit_are_refused(monkeypatch, arguments, error, message):
-    with pytest.raises(error, match=message):
+def test_arguments_that_do_not_fit_are_refused(monkeypatch, arguments, message):
+    with pytest.raises(ValueError, match=message):
         run(monkeypatch, *arguments)
+
+
+# What the made-up images stand for: the disparity that a matcher reads out of their left red channel.
+RED_MATCHER = "def predict(left, right):\n    return left[:, 0] / 4 + 0.5\n"
+LAYOUTS = [(name, variant) for name, benchmark in BENCHMARKS.items() for variant in benchmark.variants or ("",)]
+
+
+@pytest.mark.parametrize(("name", "variant"), LAYOUTS)
+def test_a_benchmark_in_its_official_layout_is_scored_as_counted_pixel_by_pixel(monkeypatch, tmp_path, capsys, name, variant):
+    pairs = write_benchmark(name, tmp_path / "data", variant)
+    (tmp_path / "red_matcher.py").write_text(RED_MATCHER)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", sys.path[:])
+    out, lines = tmp_path / "scores.json", tmp_path / "scores.csv"
+    run(
+        monkeypatch,
+        *["--model", "red_matcher:predict", "--dataset", name, "--root", "data", "--device", "cpu", "--json", out, "--csv", lines],
+        *(["--variant", variant] if variant else []),
+        *(["--below", 30, 50] if name == "middlebury" else []),
+    )
+    monkeypatch.delitem(sys.modules, "red_matcher")
+    report = json.loads(out.read_text())
+    assert [scores["name"] for scores in report["pairs"]] == list(pairs)
+    limits = {"middlebury": (30, 50), "sceneflow": (192,)}.get(name, ())
+    plain: dict[str, list[dict]] = {}
+    for scores, pair in zip(report["pairs"], pairs.values(), strict=True):
+        prediction = pair.left[..., 0] / 4 + 0.5
+        valid = np.isfinite(pair.truth) & (pair.truth > 0)
+        parts = {"": valid, "_edges": plain_edges(pair.truth, valid), **{f"_below_{limit}": pair.truth < limit for limit in limits}}
+        for part, counted in parts.items():
+            expected = plain_scores(prediction, pair.truth, counted)
+            assert scores[f"all{part}"] == pytest.approx(expected, rel=1e-6)
+            plain.setdefault(f"all{part}", []).append(expected)
+            if pair.nonoccluded is None:
+                assert scores[f"noc{part}"] is None
+            else:
+                expected = plain_scores(prediction, pair.truth, counted & pair.nonoccluded)
+                assert scores[f"noc{part}"] == pytest.approx(expected, rel=1e-6)
+                plain.setdefault(f"noc{part}", []).append(expected)
+    for region, both in plain.items():
+        assert report["mean"][region]["bad_2"] == pytest.approx((both[0]["bad_2"] + both[1]["bad_2"]) / 2, rel=1e-6)
+        pixels = both[0]["pixels"] + both[1]["pixels"]
+        expected = sum(scores["bad_3"] * scores["pixels"] for scores in both) / pixels
+        assert report["means"]["mean over pixels"][region]["bad_3"] == pytest.approx(expected, rel=1e-6)
+    weathers = [title for title in report["means"] if title not in ("mean over pairs", "mean over pixels")]
+    assert weathers == (["foggy, mean over pairs", "rainy, mean over pairs"] if name == "drivingstereo" else [])
+    assert report["complete"] is False and (report["variant"] or "") == variant
+    shown = capsys.readouterr()
+    assert f"only 2 of the {BENCHMARKS[name].pairs} pairs of {name} are there" in shown.err
+    assert all(title in shown.out for title in pairs) and lines.read_text().count("mean over pairs") >= len(plain)
+
+
+@pytest.mark.skipif(not SHARED_PAIRS.is_dir(), reason="no development data")
+def test_sgbm_is_fair_on_all_real_pairs(monkeypatch, tmp_path):
+    common = ["--model", "sgbm", "--dataset", "folder", "--root", SHARED_PAIRS]
+    run(monkeypatch, *common, "--json", tmp_path / "scores.json", "--pictures", tmp_path / "pictures")
+    report = json.loads((tmp_path / "scores.json").read_text())
+    assert len(report["pairs"]) == 12 and len(list((tmp_path / "pictures").iterdir())) == 24
+    assert report["mean"]["all"]["bad_2"] < 0.11 and report["mean"]["noc"]["bad_2"] < 0.05
+    assert report["mean"]["all_edges"]["bad_2"] > 2 * report["mean"]["all"]["bad_2"]
+    assert all(pair["all"]["bad_2"] < 0.2 for pair in report["pairs"])
 
 
 def test_checkpoints_that_do_not_fit_are_named(tmp_path, checkpoint):
@@ -205,7 +267,7 @@ def test_the_command_runs_from_the_repository_and_fails_in_one_line():
         return subprocess.run([sys.executable, "trainers/evaluate.py", *arguments], cwd=REPOSITORY, capture_output=True, text=True)
 
     help_text = run_script("--help").stdout
-    for word in ("--checkpoint", "--n-gru-layers", "mask_left.png", "kitti2015", "EPE"):
+    for word in ("--checkpoint", "--n-gru-layers", "mask_left.png", "disp_noc_0", "EPE", "package.module:callable"):
         assert word in help_text
     failed = run_script("--model", "raft", "--dataset", "motorcycle", "--checkpoint", "missing.pth")
     assert failed.returncode == 1 and failed.stderr.strip().splitlines()[-1] == "evaluate.py: no checkpoint file missing.pth"
