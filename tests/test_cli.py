@@ -5,6 +5,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import time
 import warnings
 
 import cv2
@@ -14,6 +15,7 @@ import pytest
 import zsdata
 from zsdata import cli
 from zsdata.example_photos import EXAMPLE_PHOTOS
+from zsdata.exported import load_exported, read_exported
 from zsdata.source.archive import read_shard
 
 from .scenes import grey_fill, jpeg, layered_depth, photo, photo_tar, write_tar
@@ -69,7 +71,7 @@ def command(*arguments, **options):
 def test_help_explains_each_command_with_an_example(run):
     status, out, _ = run("--help")
     assert status == 0
-    for name in ("pack", "example", "verify", "preview"):
+    for name in ("pack", "example", "verify", "preview", "export"):
         assert f"\n    {name} " in out
         status, of_command, _ = run(name, "--help")
         assert status == 0
@@ -78,7 +80,7 @@ def test_help_explains_each_command_with_an_example(run):
 
 
 def test_the_examples_in_the_help_are_commands_that_parse(run):
-    for name in ("pack", "example", "verify", "preview"):
+    for name in ("pack", "example", "verify", "preview", "export"):
         example = run(name, "--help")[1].partition("Example: zsdata ")[2]
         assert cli._parser().parse_args(shlex.split(example)).run is not None
 
@@ -247,6 +249,74 @@ def test_a_full_disk_leaves_the_old_preview_and_nothing_else(run, tmp_path, monk
     status, _, error = run("preview", "--sources", shard, "--output", sheet, "--pairs", 1, "--size", 64, 64)
     assert status == 2 and in_words(error).endswith(": No space left on device\n")
     assert sheet.read_bytes() == b"old" and sorted(path.name for path in tmp_path.iterdir()) == ["a.tar", "p.png"]
+
+
+@pytest.mark.usefixtures("cheap")
+def test_export_writes_a_pair_per_photo_and_goes_on_where_it_stopped(run, tmp_path):
+    shard = photo_tar(tmp_path / "a.tar", count=3)
+    export = ("export", "--sources", shard, "--output", tmp_path / "my pairs", "--size", 64, 96, "--seed", 5)
+    status, out, error = run(*export)
+    assert (status, error) == (0, "") and out.startswith(f"{tmp_path}/my pairs: 3 pairs (") and "already" not in out
+    stream = zsdata.ZeroStereoStream(shard, size=(64, 96), depth=layered_depth, inpaint=grey_fill, seed=5)
+    for index, entry in enumerate(read_exported(tmp_path / "my pairs")):
+        pair = load_exported(entry)
+        assert np.array_equal(pair.right, stream.replay(0, index).right_clean.round().byte().permute(1, 2, 0).numpy())
+    status, out, _ = run(*export, "--workers", 1)
+    assert status == 0 and out.endswith(", 3 of them already there\n")
+
+
+@pytest.mark.usefixtures("cheap")
+def test_export_says_which_photos_were_replaced(run, tmp_path):
+    shard = write_tar(tmp_path / "a.tar", {"bad.jpg": b"<html>", "good.jpg": jpeg(photo(0))})
+    status, out, _ = run("export", "--sources", shard, "--output", tmp_path / "out", "--size", 64, 64)
+    assert status == 0 and "2 pairs" in out and "replaced: not a JPEG, PNG or WebP: 1" in out
+
+
+@pytest.mark.usefixtures("cheap")
+def test_export_refuses_in_words(run, tmp_path):
+    shard, output = photo_tar(tmp_path / "a.tar", count=1), tmp_path / "out"
+    small = ("--size", 64, 64)
+    assert run("export", "--sources", shard, "--output", output, *small)[0] == 0
+    (tmp_path / "other" / "left").mkdir(parents=True)
+    before = sorted(tmp_path.rglob("*"))
+    for arguments, expected in (
+        (["--output", output, "--size", 96, 64], "size was [64, 64] and is [96, 64]"),
+        (["--output", output, *small, "--pairs", 2], "pairs was 1 and is 2"),
+        (["--output", output, *small, "--depth", "other"], 'depth was "builtin" and is "other"'),
+        (["--output", output, *small, "--inpaint", "other"], 'inpaint was "builtin" and is "other"'),
+        (["--output", tmp_path / "other", *small], "holds left, which no export made"),
+        (["--output", shard, *small], "a.tar is not a folder"),
+        (["--output", tmp_path / "new", "--size", 8, 8], "32 or more"),
+        (["--output", tmp_path / "new", "--sources", tmp_path / "none.tar"], "none.tar"),
+    ):
+        status, out, error = run("export", "--sources", shard, *arguments)
+        assert (status, out) == (2, "") and expected in in_words(error)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_an_export_that_is_killed_goes_on_to_the_same_bytes(tmp_path):
+    shard = photo_tar(tmp_path / "a.tar", count=12)
+    arguments = ("export", "--sources", shard, "--size", 64, 96, "--workers", 1, "--output")
+    process = command(*arguments, tmp_path / "killed")
+    filelist, deadline = tmp_path / "killed" / "filelist.txt", time.monotonic() + 60
+    while not (filelist.exists() and filelist.read_bytes()):
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.005)
+    process.kill()
+    process.wait()  # its worker may live a little longer
+    for pipe in (process.stdout, process.stderr):
+        assert pipe is not None
+        pipe.close()
+    lines = filelist.read_text().splitlines(keepends=True)
+    assert 0 < len(lines) < 12 and all((tmp_path / "killed" / name).is_file() for line in lines for name in line.split())
+    for folder in ("killed", "unbroken"):
+        out, _ = command(*arguments, tmp_path / folder).communicate()
+        assert "12 pairs" in out and ("already there" in out) == (folder == "killed")
+    trees = [
+        {path.relative_to(tmp_path / folder): path.read_bytes() for path in (tmp_path / folder).rglob("*") if path.is_file()}
+        for folder in ("killed", "unbroken")
+    ]
+    assert trees[0] == trees[1]
 
 
 @pytest.mark.filterwarnings("always")

@@ -19,6 +19,7 @@ from tqdm import tqdm
 import zsdata
 from zsdata.augment import AugmentConfig
 from zsdata.example_photos import EXAMPLE_PHOTOS, pack_example_photos
+from zsdata.export import export_pairs
 from zsdata.faults import BadShard, NoUsablePhoto, TooManyFaults
 from zsdata.preview import contact_sheet
 from zsdata.sample import StereoBatch
@@ -137,6 +138,38 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--size", metavar=("HEIGHT", "WIDTH"), nargs=2, type=_positive, default=(384, 512), help="of a pair in pixels (default: 384 512)"
     )
+    _add_steps(command)
+    command.add_argument("--clean", action="store_true", help="show the pairs without their augmentation")
+
+    command = add(
+        _export,
+        "export",
+        "write pairs to disk, in the layout of ZeroStereo's published data set",
+        "Makes pairs without augmentation and writes them to DIR: left image (JPEG), right image (PNG), disparity and confidence (.npy), "
+        "masks of what is visible in the right image and of what was invented there (PNG, 255 is yes), where the pair comes from (JSON), "
+        "and filelist.txt, which the published training code takes and which names whole pairs only. Stopped at any moment, the same "
+        "command goes on where it stopped, and the files come out the same.",
+        example="zsdata export --sources shards --output pairs --workers 2",
+    )
+    command.add_argument("--sources", metavar="SHARDS", nargs="+", required=True, help=_URLS)
+    command.add_argument("--output", metavar="DIR", required=True, type=Path, help="folder for the pairs; made if missing")
+    command.add_argument("--pairs", metavar="N", type=_positive, help="how many (default: one per photo)")
+    command.add_argument("--epoch", metavar="E", type=_count, default=0, help="of the first pair (default: %(default)s)")
+    command.add_argument(
+        "--size", metavar=("HEIGHT", "WIDTH"), nargs=2, type=_positive, help="of a pair in pixels (default: the whole photo, as published)"
+    )
+    _add_steps(command)
+    command.add_argument(
+        "--workers",
+        metavar="N",
+        type=_count,
+        default=0,
+        help="processes that prepare pairs, beside the one that inpaints and writes (default: %(default)s)",
+    )
+    return parser
+
+
+def _add_steps(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--depth", metavar="NAME", default="builtin", help='"builtin", or a Hub id or folder in the transformers format (default: builtin)'
     )
@@ -147,8 +180,6 @@ def _parser() -> argparse.ArgumentParser:
         help='"builtin", "background" (another photo), or a Hub id or folder in the diffusers format (default: builtin)',
     )
     command.add_argument("--seed", metavar="N", type=_count, default=0, help="of the stream (default: %(default)s)")
-    command.add_argument("--clean", action="store_true", help="show the pairs without their augmentation")
-    return parser
 
 
 def _add_overwrite(command: argparse.ArgumentParser) -> None:
@@ -236,6 +267,33 @@ def _preview(options: argparse.Namespace) -> int:
     refused = stream.stats()["rejected"]
     if refused:
         print(f"photos that could not be used and were replaced: {', '.join(f'{reason}: {n:,}' for reason, n in refused.items())}")
+    return OK
+
+
+def _export(options: argparse.Namespace) -> int:
+    shards = expand_urls(options.sources)
+    size = None if options.size is None else tuple(options.size)
+    stream = ZeroStereoStream(
+        shards,
+        size=size,
+        depth=load_depth(options.depth),
+        inpaint=load_inpainter(options.inpaint),
+        seed=options.seed,
+        augmentation=AugmentConfig.none(),
+    )
+    report = export_pairs(
+        stream,
+        options.output,
+        pairs=options.pairs,
+        epoch=options.epoch,
+        workers=options.workers,
+        settings={"size": size, "depth": options.depth, "inpaint": options.inpaint},
+    )
+    already_there = f", {report.already_there:,} of them already there" if report.already_there else ""
+    print(f"{_printable(str(options.output))}: {_several(report.pairs, 'pair')} ({_megabytes(report.bytes)}){already_there}")
+    if report.replaced:
+        reasons = ", ".join(f"{reason}: {count:,}" for reason, count in report.replaced.most_common())
+        print(f"photos that could not be used and were replaced: {_printable(reasons)}")
     return OK
 
 
