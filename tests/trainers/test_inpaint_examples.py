@@ -1,0 +1,292 @@
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from tests.scenes import jpeg, layered_depth, photo, photo_tar, write_tar
+from trainers.inpaint_data.examples import SYMMETRIC_COLOUR, from_photo, from_stereo, hidden_from_left
+from trainers.inpaint_data.sources import ExampleBatch, Examples, PhotoSource, StereoSource, requests
+from trainers.inpaint_data.stored_maps import StereoFrame
+from zsdata.augment import AugmentConfig
+from zsdata.faults import BadPhoto, NoUsablePhoto
+from zsdata.seeding import rng
+from zsdata.source.manifest import build_manifest
+from zsdata.synthesis.disparity import AdaptiveDisparity
+from zsdata.synthesis.warp import forward_warp
+
+
+def hidden_row(disparity):
+    """The definition, in the right view's own columns: True where the left camera does not see right pixel u.
+
+    Right pixel u with disparity d lands at u + d in the left view and covers half a pixel each way; neighbours whose disparities differ by
+    at most 1 px are one surface and also cover what lies between them. u is seen if the left column nearest to u + d lies in the image
+    and shows nothing that is nearer by more than 1 px.
+    """
+    width = len(disparity)
+    shown = np.full(width, -np.inf)  # of the nearest surface, in each left column
+    for x in range(width):
+        for u, d in enumerate(disparity):
+            if abs(u + d - x) <= 0.5:
+                shown[x] = max(shown[x], d)
+            if u + 1 < width and abs(disparity[u + 1] - d) <= 1:
+                ends = sorted((u + d, u + 1 + disparity[u + 1]))
+                if ends[0] <= x <= ends[1]:
+                    share = (x - u - d) / (1 + disparity[u + 1] - d) if ends[1] > ends[0] else 0.0
+                    shown[x] = max(shown[x], d + share * (disparity[u + 1] - d))
+    nearest = np.rint(np.arange(width) + disparity).astype(int)
+    return np.array([not (x < width and shown[x] <= d + 1) for x, d in zip(nearest, disparity, strict=True)])
+
+
+def scene(random, width=48):
+    """One row of disparity: a slanted background with things before it."""
+    disparity = random.uniform(0, 3) + np.linspace(0, random.uniform(0, 2), width)
+    for _ in range(random.integers(1, 4)):
+        start, length = random.integers(width), random.integers(1, 14)
+        disparity[start : start + length] = random.uniform(3, 15) + random.uniform(-0.2, 0.2) * np.arange(
+            len(disparity[start : start + length])
+        )
+    return disparity.clip(0.01).astype(np.float32)
+
+
+def test_hidden_pixels_are_those_of_the_definition():
+    random = np.random.default_rng(0)
+    rows = np.stack([scene(random) for _ in range(150)])
+    hidden = hidden_from_left(torch.from_numpy(rows)[None, None])[0, 0].numpy()
+    assert np.array_equal(hidden, np.stack([hidden_row(row.astype(np.float64)) for row in rows]))
+    assert 0.1 < hidden.mean() < 0.6
+
+
+def test_behind_the_right_edge_of_a_thing_as_wide_as_it_stands_out_and_at_the_right_border():
+    disparity = torch.full((1, 1, 2, 40), 2.0)
+    disparity[..., 10:18] = 7.0
+    hidden = hidden_from_left(disparity)[0, 0, 0].nonzero().flatten().tolist()
+    assert hidden == [18, 19, 20, 21, 22, 38, 39]
+
+
+def test_the_masked_pixels_are_those_that_a_warp_of_the_left_view_leaves_open():
+    """A scene of fronto-parallel things seen by both cameras: the holes of the left view's warp are what the right view has hidden."""
+    random = np.random.default_rng(1)
+    width = 160
+    for _ in range(30):
+        left, right = np.full(width, 3.0, np.float32), np.full(width, 3.0, np.float32)
+        for nearness in sorted(random.integers(6, 20, 3)):
+            start = random.integers(25, 110)
+            left[start : start + 15] = right[start - nearness : start - nearness + 15] = nearness
+        holes = forward_warp(torch.zeros(1, 1, 1, width), torch.from_numpy(left)[None, None, None]).inpaint_mask
+        assert torch.equal(hidden_from_left(torch.from_numpy(right)[None, None, None]), holes)
+
+
+def drawing(seed=0, step=0, index=0):
+    return partial(rng, seed, step, index)
+
+
+def plain(monkeypatch):
+    monkeypatch.setattr("trainers.inpaint_data.examples.SYMMETRIC_COLOUR", AugmentConfig.none())
+
+
+def stereo(seed=0, height=40, width=64, disparity=5.0, right_disparity=None):
+    """A pair of a wall with a thing before it: the right image is what a camera sees, what the left one cannot included."""
+    scene = photo(seed, height, width + 30)
+    left, right = scene[:, 10 : 10 + width].copy(), scene[:, 15 : 15 + width].copy()
+    near = photo(seed + 1, 12, 14)
+    left[14:26, 30:44], right[14:26, 18:32] = near, near
+    truth = np.full((height, width), disparity, np.float32)
+    truth[14:26, 30:44] = 12
+    return StereoFrame(left, right, truth, right_disparity)
+
+
+def test_a_stereo_example_shows_the_right_image_through_the_holes_of_the_warp(monkeypatch):
+    plain(monkeypatch)
+    frame = stereo()
+    right, warped, inpaint_mask = from_stereo(frame, (40, 64), drawing())
+    assert torch.equal(right[0].permute(1, 2, 0), torch.from_numpy(frame.right).float())
+    assert not warped[inpaint_mask.expand_as(warped)].any()
+    error = (warped - right).abs().masked_fill(inpaint_mask, 0)
+    edge = torch.zeros(40, 64, dtype=torch.bool)
+    edge[13:27, 16:34] = True  # the thing has grown by a pixel
+    assert error.masked_fill(edge, 0).max() == 0 and error[..., 15:25, 19:31].max() == 0
+    columns = inpaint_mask[0, 0, 20].nonzero().flatten().tolist()
+    assert columns == [33, 34, 35, 36, 37, 38, 39, *range(59, 64)]
+
+
+def test_what_nobody_knows_is_a_hole(monkeypatch):
+    plain(monkeypatch)
+    frame = stereo()
+    frame.disparity[5, 20:25] = np.nan
+    inpaint_mask = from_stereo(frame, (40, 64), drawing()).inpaint_mask
+    assert inpaint_mask[0, 0, 5].nonzero().flatten().tolist() == [*range(15, 20), *range(59, 64)]
+
+
+def test_a_crop_is_the_same_part_of_the_whole_and_lies_everywhere(monkeypatch):
+    plain(monkeypatch)
+    frame = stereo()
+    whole, places = from_stereo(frame, (40, 64), drawing()), set()
+    for index in range(60):
+        part = from_stereo(frame, (24, 32), drawing(index=index))
+        matches = [
+            (top, left)
+            for top in range(17)
+            for left in range(33)
+            if torch.equal(part.right, whole.right[..., top : top + 24, left : left + 32])
+        ]
+        assert len(matches) == 1
+        top, left = matches[0]
+        places.add(matches[0])
+        for cut, uncut in zip(part, whole, strict=True):
+            assert torch.equal(cut, uncut[..., top : top + 24, left : left + 32]), "the margins count"
+    tops, lefts = zip(*places, strict=True)
+    assert len(places) > 50 and min(tops) == 0 and max(tops) == 16 and min(lefts) <= 1 and max(lefts) >= 31
+
+
+def test_cameras_change_places_in_a_mirror_where_both_truths_are_known(monkeypatch):
+    plain(monkeypatch)
+    frame = stereo(right_disparity=np.full((40, 64), 5, np.float32))
+    there = [from_stereo(frame, (40, 64), drawing(index=index)) for index in range(20)]
+    mirrored = [not torch.equal(example.right[0].permute(1, 2, 0), torch.from_numpy(frame.right).float()) for example in there]
+    assert 4 < sum(mirrored) < 16
+    example = there[mirrored.index(True)]
+    assert torch.equal(example.right[0].permute(1, 2, 0), torch.from_numpy(frame.left[:, ::-1].copy()).float())
+    outside = (example.warped - example.right).abs()[..., :12, :59]
+    assert outside.max() == 0 and not example.inpaint_mask[..., :12, :59].any()
+
+
+def test_a_small_pair_is_enlarged_with_its_disparity(monkeypatch):
+    plain(monkeypatch)
+    right, warped, inpaint_mask = from_stereo(stereo(), (80, 128), drawing())
+    assert right.shape == (1, 3, 80, 128)
+    assert inpaint_mask[0, 0, 0].nonzero().flatten().tolist() == list(range(118, 128))
+    assert (warped - right).abs()[..., :20, :118].mean() < 1
+
+
+def test_both_images_get_the_same_colours():
+    flat = np.full((40, 64, 3), (200, 60, 20), np.uint8)
+    frame = StereoFrame(flat, flat, np.full((40, 64), 5, np.float32), None)
+    seen = set()
+    for index in range(20):
+        right, warped, inpaint_mask = from_stereo(frame, (32, 32), drawing(index=index))
+        assert torch.allclose(warped, right.masked_fill(inpaint_mask, 0), atol=1e-3)
+        seen.add(tuple(right[0, :, 0, 0].round().tolist()))
+    assert len(seen) > 15
+    assert SYMMETRIC_COLOUR.asymmetric_probability == 0 and SYMMETRIC_COLOUR.brightness == (0.6, 1.4)
+
+
+def test_a_photo_is_the_truth_of_what_a_left_view_hides(monkeypatch):
+    plain(monkeypatch)
+    image = photo(3, 64, 96)
+    inverse_depth = torch.zeros(1, 1, 64, 96)
+    inverse_depth[..., 20:40, 30:50] = 1.0
+    shares = []
+    for index in range(40):
+        draw = drawing(index=index)
+        right, warped, inpaint_mask = from_photo(image, inverse_depth, AdaptiveDisparity(), (64, 96), draw)
+        mirrored = draw("view").random() < 0.5
+        truth = image[:, ::-1] if mirrored else image
+        assert torch.equal(right[0].permute(1, 2, 0), torch.from_numpy(truth.copy()).float())
+        assert torch.equal(warped, right.masked_fill(inpaint_mask, 0))
+        nearest_px = AdaptiveDisparity().draw_scale(draw("disparity"), 96) * 96
+        first = 97 - 30 if mirrored else 51  # the thing, a pixel larger, ends before
+        hidden = inpaint_mask[0, 0, 30].nonzero().flatten()
+        hidden = hidden[hidden < 90]
+        assert hidden.tolist() == list(range(first, first + len(hidden))) and abs(len(hidden) - nearest_px) <= 1
+        assert not inpaint_mask[0, 0, 10, :90].any()
+        shares.append(mirrored)
+    assert 10 < sum(shares) < 30
+
+
+def photos(tmp_path, count=5, **members):
+    return PhotoSource(build_manifest(photo_tar(tmp_path / "photos.tar", count, height=48, width=64)), layered_depth, AdaptiveDisparity())
+
+
+class Pairs:
+    """Three pairs, of which one is broken."""
+
+    digest = "pairs"
+
+    def __init__(self, broken=()):
+        self.broken = broken
+
+    def __len__(self):
+        return 3
+
+    def place(self, index):
+        return "somewhere", f"pair {index}"
+
+    def read(self, index):
+        if index in self.broken:
+            raise BadPhoto("damaged map: nothing")
+        return stereo(10 * index)
+
+
+def test_an_example_is_a_function_of_seed_step_and_index(tmp_path):
+    def make(seed=0, batch_size=4, **more):
+        return Examples({"photos": photos(tmp_path), "pairs": StereoSource(Pairs(**more))}, (32, 48), seed, batch_size)
+
+    one, other = make(), make()
+    for request in ((0, 0), (3, 1), (70, 2)):
+        first, again = one[request], other[request]
+        assert all(torch.equal(getattr(first, name), getattr(again, name)) for name in ("right", "warped", "inpaint_mask"))
+        assert first.requests == [request] and first.places == again.places and first.right.dtype == torch.uint8
+    assert not torch.equal(one[0, 0].right, make(seed=1)[0, 0].right)
+    # every pair and photo once an epoch, whatever the batch size
+    for batch_size in (2, 4):
+        examples = make(batch_size=batch_size)
+        for epoch in range(2):
+            numbers = range(8 * epoch, 8 * epoch + 8)
+            assert len({examples[divmod(number, batch_size)].places[0] for number in numbers}) == 8
+
+
+def test_a_broken_pair_is_replaced_and_told(tmp_path):
+    examples = Examples({"pairs": StereoSource(Pairs(broken=(1,)))}, (32, 48), 0, 4)
+    made = [examples[divmod(number, 4)] for number in range(30)]
+    rejected = [example.rejected for example in made if example.rejected]
+    assert 5 < len(rejected) <= 15 and all(entry == [("pairs", "somewhere", "pair 1", "damaged map: nothing")] for entry in rejected)
+    assert {place for example in made for place in example.places} == {"pair 0 in somewhere", "pair 2 in somewhere"}
+    with pytest.raises(NoUsablePhoto, match="nothing usable for example 0 of step 0: 3 of pairs were refused"):
+        Examples({"pairs": StereoSource(Pairs(broken=(0, 1, 2)))}, (32, 48), 0, 4)[0, 0]
+
+
+def test_a_photo_that_shows_no_scene_is_refused(tmp_path):
+    tar = write_tar(tmp_path / "a.tar", {"0.jpg": jpeg(photo(0, 20, 64))})
+    examples = Examples({"photos": PhotoSource(build_manifest(tar), layered_depth, AdaptiveDisparity())}, (32, 48), 0, 1)
+    with pytest.raises(NoUsablePhoto, match="too small"):
+        examples[0, 0]
+
+
+def test_an_error_names_its_example(tmp_path):
+    def broken(images):
+        raise ZeroDivisionError("no depth")
+
+    source = PhotoSource(build_manifest(photo_tar(tmp_path / "a.tar", 1)), broken, AdaptiveDisparity())
+    with pytest.raises(RuntimeError, match=r'example 1 of step 2 \("000000" in .*a.tar\) failed: no depth'):
+        Examples({"photos": source}, (32, 48), 0, 4)[2, 1]
+
+
+@pytest.mark.parametrize(("world_size", "micro_batch"), [(1, 1), (1, 8), (2, 2), (4, 2), (2, 4)])
+def test_all_ranks_together_get_every_example_of_a_step_once(world_size, micro_batch):
+    ranks = [list(requests(3, 5, 8, micro_batch, rank, world_size)) for rank in range(world_size)]
+    assert all(len(batches) == 2 * 8 // (world_size * micro_batch) for batches in ranks)
+    assert sorted(request for batches in ranks for batch in batches for request in batch) == [(s, i) for s in (3, 4) for i in range(8)]
+
+
+def test_the_position_tells_other_data_and_other_options_apart(tmp_path):
+    def place(size=(32, 48), seed=0, batch_size=4, pairs=None, step=7):
+        return Examples({"pairs": StereoSource(pairs or Pairs())}, size, seed, batch_size).position(step)
+
+    other = Pairs()
+    other.digest = "other pairs"
+    assert (place().epoch, place().samples) == (9, 1)
+    assert place(seed=1).seed != place().seed
+    assert place(pairs=other).manifest != place().manifest
+    assert len({place().configuration, place(size=(48, 32)).configuration, place(batch_size=2).configuration}) == 3
+
+
+def test_batches_stack_in_order():
+    parts = [
+        ExampleBatch(
+            torch.full((1, 3, 2, 2), i, dtype=torch.uint8), torch.zeros(1, 3, 2, 2), torch.zeros(1, 1, 2, 2) > 0, [(0, i)], [str(i)], []
+        )
+        for i in range(3)
+    ]
+    batch = ExampleBatch.stack(parts)
+    assert batch.right[:, 0, 0, 0].tolist() == [0, 1, 2] and batch.requests == [(0, 0), (0, 1), (0, 2)] and batch.places == ["0", "1", "2"]

@@ -1,0 +1,208 @@
+"""Which example is number i of step s: a function of (seed, s, i), the data and nothing else; faults are replaced and counted."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import Protocol
+
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from trainers.inpaint_data.examples import Draw, Example, from_photo, from_stereo
+from trainers.inpaint_data.layouts import StereoFolder
+from trainers.inpaint_data.tars import StereoTars
+from zsdata.faults import BadPhoto, BadShard, NoUsablePhoto
+from zsdata.plan import Choice, EpochPlan
+from zsdata.position import Position
+from zsdata.seeding import rng
+from zsdata.source.manifest import Manifest
+from zsdata.source.photo import decode_rgb
+from zsdata.synthesis.depth import DepthEstimator, load_depth
+from zsdata.synthesis.disparity import AdaptiveDisparity
+from zsdata.synthesis.synthesizer import SynthesisConfig, estimate_depth
+from zsdata.worker import MOST_SPARES, SHORTEST_SIDE_PX, single_thread
+
+
+class Source(Protocol):
+    """Something that examples can be made of, by number."""
+
+    @property
+    def digest(self) -> str: ...
+
+    def __len__(self) -> int: ...
+
+    def place(self, index: int) -> tuple[str, str]:
+        """Where it lies, and its name there."""
+        ...
+
+    def make(self, index: int, size: tuple[int, int], draw: Draw) -> Example:
+        """Raises BadPhoto or BadShard where it cannot be used."""
+        ...
+
+
+@dataclass(frozen=True)
+class StereoSource:
+    """Examples of stereo pairs with their true disparity."""
+
+    pairs: StereoFolder | StereoTars
+
+    @property
+    def digest(self) -> str:
+        return self.pairs.digest
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def place(self, index: int) -> tuple[str, str]:
+        return self.pairs.place(index)
+
+    def make(self, index: int, size: tuple[int, int], draw: Draw) -> Example:
+        return from_stereo(self.pairs.read(index), size, draw)
+
+
+class PhotoSource:
+    """Examples of single photos. The depth estimator is loaded at the first one, in the process that uses it.
+
+    Args:
+        manifest: of the tars that hold the photos.
+        depth: as `load_depth` takes it.
+        scale: draws how far apart the cameras stand.
+    """
+
+    def __init__(self, manifest: Manifest, depth: str | DepthEstimator, scale: AdaptiveDisparity) -> None:
+        self._manifest, self._name, self._scale = manifest, depth, scale
+        self._depth: DepthEstimator | None = None
+
+    @property
+    def digest(self) -> str:
+        depth = self._name if isinstance(self._name, str) else getattr(self._name, "__qualname__", type(self._name).__qualname__)
+        return hashlib.sha256(json.dumps([self._manifest.digest, depth, asdict(self._scale)]).encode()).hexdigest()
+
+    def __len__(self) -> int:
+        return len(self._manifest)
+
+    def place(self, index: int) -> tuple[str, str]:
+        member = self._manifest.member(index)
+        return member.shard_url, member.key
+
+    def make(self, index: int, size: tuple[int, int], draw: Draw) -> Example:
+        photo = decode_rgb(self._manifest.read(index))
+        height, width = photo.shape[:2]
+        if min(height, width) < SHORTEST_SIDE_PX:
+            raise BadPhoto(f"too small: a side shorter than {SHORTEST_SIDE_PX} px: {width}x{height}")
+        if self._depth is None:
+            self._depth = load_depth(self._name)
+        image = torch.from_numpy(photo).permute(2, 0, 1)[None].to(torch.float32, memory_format=torch.contiguous_format)
+        with torch.inference_mode():
+            depth = estimate_depth(self._depth, image, SynthesisConfig(flip_confidence=False))
+            return from_photo(photo, depth.inverse_depth, self._scale, size, draw)
+
+
+@dataclass(frozen=True)
+class ExampleBatch:
+    """Examples as they cross the process border: images uint8 [B, 3, H, W], `inpaint_mask` bool [B, 1, H, W], True in holes.
+
+    `requests` holds (step, index) of each, `places` where it comes from; `rejected` lists (source, place, name, reason) of what could
+    not be used. `right` is the truth; `warped` is 0 in its holes.
+    """
+
+    right: Tensor
+    warped: Tensor
+    inpaint_mask: Tensor
+    requests: list[tuple[int, int]]
+    places: list[str]
+    rejected: list[tuple[str, str, str, str]]
+
+    @staticmethod
+    def stack(examples: list[ExampleBatch]) -> ExampleBatch:
+        """Several batches to one, in order."""
+        return ExampleBatch(
+            right=torch.cat([example.right for example in examples]),
+            warped=torch.cat([example.warped for example in examples]),
+            inpaint_mask=torch.cat([example.inpaint_mask for example in examples]),
+            requests=[request for example in examples for request in example.requests],
+            places=[place for example in examples for place in example.places],
+            rejected=[reject for example in examples for reject in example.rejected],
+        )
+
+    def pin_memory(self) -> ExampleBatch:
+        """The same in page-locked memory (called by torch's DataLoader)."""
+        images = {name: getattr(self, name).pin_memory() for name in ("right", "warped", "inpaint_mask")}
+        return replace(self, **images)
+
+
+class Examples(Dataset):
+    """All examples of a training; (step, index of the step's batch) in, a batch of one out.
+
+    Epoch after epoch goes through all sources in an order of its own; every pair and photo comes once in each.
+
+    Args:
+        sources: by name. A source keeps its order whatever stands beside it.
+        size: (height, width) of the crops, in pixels.
+        batch_size: examples of one step, over all ranks and accumulated batches.
+    """
+
+    def __init__(self, sources: Mapping[str, Source], size: tuple[int, int], seed: int, batch_size: int) -> None:
+        sizes = tuple(len(source) for source in sources.values())
+        self._sources, self._size, self._seed, self._batch_size = dict(sources), size, seed, batch_size
+        self._plan = EpochPlan(seed, tuple(sources), sizes, sizes)
+
+    def __len__(self) -> int:
+        """Pairs and photos in all."""
+        return self._plan.epoch_size
+
+    def __getitem__(self, request: tuple[int, int]) -> ExampleBatch:
+        """Raises NoUsablePhoto when no spare can be used either, RuntimeError when a step fails, with the example named."""
+        step, index = request
+        epoch, place = divmod(step * self._batch_size + index, len(self))
+        draw = partial(rng, self._seed, step, index)
+        rejected: list[tuple[str, str, str, str]] = []
+        choice: Choice | None = self._plan.choose(epoch, place)
+        with single_thread():
+            while choice is not None and len(rejected) <= MOST_SPARES:
+                name, source = list(self._sources.items())[choice.source]
+                where = source.place(choice.member)
+                try:
+                    right, warped, inpaint_mask = source.make(choice.member, self._size, draw)
+                    return ExampleBatch(
+                        _to_uint8(right), _to_uint8(warped), inpaint_mask, [request], [f"{where[1]} in {where[0]}"], rejected
+                    )
+                except (BadPhoto, BadShard) as fault:
+                    rejected.append((name, *where, fault.reason))
+                except Exception as error:
+                    raise RuntimeError(f'example {index} of step {step} ("{where[1]}" in {where[0]}) failed: {error}') from error
+                choice = self._plan.spare(epoch, place, len(rejected) - 1)
+        last = "; ".join(f"{name} in {where}: {reason}" for _, where, name, reason in rejected[-3:])
+        raise NoUsablePhoto(
+            f"nothing usable for example {index} of step {step}: {len(rejected)} of {rejected[0][0]} were refused, the last ones: {last}"
+        )
+
+    def position(self, step: int) -> Position:
+        """The place before `step`: what a checkpoint keeps and checks."""
+        epoch, place = divmod(step * self._batch_size, len(self))
+        digests = [(name, len(source), source.digest) for name, source in self._sources.items()]
+        return Position(
+            seed=self._seed,
+            epoch=epoch,
+            samples=place,
+            manifest=hashlib.sha256(json.dumps(digests).encode()).hexdigest(),
+            configuration=hashlib.sha256(json.dumps([self._size, self._batch_size]).encode()).hexdigest(),
+        )
+
+
+def requests(
+    first_step: int, last_step: int, batch_size: int, micro_batch: int, rank: int, world_size: int
+) -> Iterator[list[tuple[int, int]]]:
+    """The batches of one rank: all ranks together get every example of a step once, `micro_batch` at a time."""
+    for step in range(first_step, last_step):
+        for start in range(rank * micro_batch, batch_size, world_size * micro_batch):
+            yield [(step, index) for index in range(start, start + micro_batch)]
+
+
+def _to_uint8(image: Tensor) -> Tensor:
+    return (image + 0.5).to(torch.uint8)

@@ -1,0 +1,79 @@
+"""Disparity and depth maps from the bytes of a file: PNG, PFM, NPY."""
+
+from __future__ import annotations
+
+import io
+import re
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from zsdata.faults import BadPhoto
+
+MAP_EXTENSIONS = ("png", "pfm", "npy")
+_PFM_HEADER = re.compile(rb"Pf\s+(\d{1,6})\s+(\d{1,6})\s+(-?[\d.]+(?:[eE][-+]?\d+)?)[ \t\r]*\n")
+
+
+class StereoFrame(NamedTuple):
+    """A rectified pair with the truth of at least its left view: left (x, y) is right (x - disparity, y)."""
+
+    left: np.ndarray  # uint8 [H, W, 3], RGB
+    right: np.ndarray
+    disparity: np.ndarray  # float32 [H, W], pixels, left view, > 0; NaN where nobody knows
+    right_disparity: np.ndarray | None  # the same of the right view: right (x, y) is left (x + disparity, y)
+
+    def checked(self) -> StereoFrame:
+        """Itself; raises BadPhoto where its parts differ in size or no disparity is known."""
+        for name, part in (("right image", self.right), ("disparity", self.disparity), ("right disparity", self.right_disparity)):
+            if part is not None and part.shape[:2] != self.left.shape[:2]:
+                height, width = self.left.shape[:2]
+                raise BadPhoto(f"sizes differ: the {name} is {part.shape[1]} x {part.shape[0]}, the left image {width} x {height}")
+        if not np.isfinite(self.disparity).any():
+            raise BadPhoto("no disparity: the map has no positive value")
+        return self
+
+
+def decode_map(data: bytes, extension: str) -> np.ndarray:
+    """The numbers of a map as they are stored: float32 [H, W], upright.
+
+    Args:
+        data: the file.
+        extension: "png" (one channel, 16 bits), "pfm" (one channel, either byte order) or "npy" (numbers; a pickled array is refused).
+
+    Raises:
+        BadPhoto: damaged, cut off, or another kind of file.
+    """
+    if extension == "pfm":
+        return _decode_pfm(data)
+    if extension == "npy":
+        return _decode_npy(data)
+    stored = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    if stored is None or stored.dtype != np.uint16 or stored.ndim != 2:
+        found = "no image" if stored is None else f"{stored.dtype} {list(stored.shape)}"
+        raise BadPhoto(f"damaged map: a 16-bit PNG of one channel was expected, found {found}")
+    return stored.astype(np.float32)
+
+
+def _decode_pfm(data: bytes) -> np.ndarray:
+    header = _PFM_HEADER.match(data)
+    if header is None:
+        raise BadPhoto("damaged map: it does not begin as a PFM file of one channel does (Pf, width, height, scale)")
+    width, height = int(header[1]), int(header[2])
+    values = data[header.end() :]
+    if len(values) != 4 * width * height:
+        raise BadPhoto(f"damaged map: {len(values):,} of the {4 * width * height:,} bytes of {width} x {height} values")
+    little_endian = float(header[3]) < 0
+    return np.frombuffer(values, "<f4" if little_endian else ">f4").reshape(height, width)[::-1].astype(np.float32)
+
+
+def _decode_npy(data: bytes) -> np.ndarray:
+    if not data.startswith(b"\x93NUMPY"):
+        raise BadPhoto("damaged map: it does not begin as an NPY file does")
+    try:
+        stored = np.load(io.BytesIO(data), allow_pickle=False)  # a pickled array could run code
+    except (ValueError, EOFError, OSError) as error:
+        raise BadPhoto(f"damaged map: {error}") from error
+    if stored.ndim != 2 or stored.dtype.kind not in "fiu":
+        raise BadPhoto(f"damaged map: numbers [H, W] were expected, found {stored.dtype} {list(stored.shape)}")
+    return stored.astype(np.float32)
