@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from zsdata.synthesis.indices import flat_indices
+
 SMALLEST_DISPARITY_PX = 0.01  # of the farthest point; not 0, which marks "no value" in most stereo data sets
 SHARPEN_EDGE_PX = 3.0  # Sobel magnitude above which a disparity belongs to neither side of an edge (the published threshold)
 
@@ -100,41 +102,46 @@ def sharpen_disparity(disparity: Tensor, edge_px: float = SHARPEN_EDGE_PX) -> Te
         disparity: float32 [B, 1, H, W], pixels.
         edge_px: pixels of disparity.
     """
-    edge = sobel_magnitude(disparity) > edge_px
     rows, columns = disparity.shape[-2:]
-    image, y, x = (part.int() for part in edge.squeeze(1).nonzero(as_tuple=True))
-    if not len(x) or len(x) == edge.numel():
+    edge = flat_indices(sobel_magnitude(disparity) > edge_px)
+    if not len(edge) or len(edge) == disparity.numel():
         return disparity
 
-    # In each row the nearest value at or left of x, and at or right of x; a far-away number stands for "none".
-    none = 4 * (rows + columns)
-    column = torch.arange(columns, device=disparity.device, dtype=torch.int32)
-    at_left = column.masked_fill(edge, -none).cummax(-1).values.flatten()
-    at_right = column.masked_fill(edge, none).flip(-1).cummin(-1).values.flip(-1).flatten()
+    # In each row the nearest value at or left of x, and at or right of x; -1 and `columns` stand for "none".
+    column = torch.arange(columns, device=disparity.device).repeat(disparity.numel() // columns)
+    x = column[edge]
+    begins = torch.ones_like(edge, dtype=torch.bool)  # of a run of edges in one row
+    begins[1:] = (edge[1:] != edge[:-1] + 1) | (x[1:] == 0)
+    run = begins.cumsum(0) - 1
+    at_left, at_right = column, column.clone()
+    at_left[edge] = (x[begins] - 1)[run]
+    at_right[edge] = (x[begins.roll(-1)] + 1)[run]
 
-    best = torch.full_like(x, 2 * none * none)  # squared distances
-    found = torch.zeros_like(x, dtype=torch.long)
-    pending = torch.arange(len(x), device=x.device)
+    y = torch.div(edge, columns, rounding_mode="floor") % rows
+    unknown = rows**2 + columns**2
+    best = torch.full_like(edge, unknown)  # squared distances
+    found = edge.clone()
+    pending = torch.arange(len(edge), device=edge.device)
     row_distance = 0
     while len(pending) and row_distance < rows:
+        here, x_here, y_here = edge[pending], x[pending], y[pending]
+        nearest, source = best[pending], found[pending]
         for row_step in (-row_distance, row_distance)[: 1 if row_distance == 0 else 2]:
-            row = y[pending] + row_step
-            inside = (row >= 0) & (row < rows)
-            start = (image[pending] * rows + row.clamp(0, rows - 1)).long() * columns
-            for nearest in (at_left, at_right):
-                candidate = nearest.index_select(0, start + x[pending])
-                distance = row_distance**2 + (candidate - x[pending]) ** 2
-                better = inside & (distance < best[pending]) & (candidate > -none) & (candidate < none)
-                chosen = pending[better]
-                best[chosen] = distance[better]
-                found[chosen] = (start + candidate)[better]
+            inside = (y_here + row_step >= 0) & (y_here + row_step < rows)
+            there = (here + row_step * columns).clamp_(0, disparity.numel() - 1)
+            for at in (at_left, at_right):
+                candidate = at.index_select(0, there)
+                step = candidate - x_here
+                distance = step * step + row_distance**2
+                better = inside & (distance < nearest) & (candidate >= 0) & (candidate < columns)
+                nearest = torch.where(better, distance, nearest)
+                source = torch.where(better, there + step, source)
+        best[pending], found[pending] = nearest, source
         row_distance += 1
-        pending = pending[best[pending] > row_distance**2]
+        pending = pending[nearest > row_distance**2]
 
     sharp = disparity.flatten().clone()
-    known = best < 2 * none * none
-    target = ((image * rows + y).long() * columns + x)[known]
-    sharp[target] = disparity.flatten()[found[known]]
+    sharp[edge] = sharp[found]
     return sharp.view_as(disparity)
 
 
