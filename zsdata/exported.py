@@ -45,7 +45,7 @@ KINDS = (("left", "jpg"), ("right", "png"), ("disparity", "npy"), ("confidence",
 FOLDERS = (*(kind for kind, _ in KINDS), META)
 
 # With full colour resolution (4:4:4). Measured on crops of 31 photos: 0.66 grey levels off on average, 11 at most, 0.78 bytes a pixel; at
-# quality 95 with 4:2:0, OpenCV's default, 1.5, 31 and 0.47. All of a pair takes 10 to 12 bytes a pixel.
+# quality 95 with 4:2:0, OpenCV's default, 1.5, 31 and 0.47. All of a pair takes about 10 bytes a pixel.
 JPEG_QUALITY = 98
 _JPEG = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 MAX_JPEG_SIDE = 65_500  # pixels; of libjpeg
