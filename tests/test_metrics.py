@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from tests import oracles_loss
 from tests.oracles_scores import plain_edges
-from zsdata.metrics import bad_pixel_rate, d1, disparity_edges, end_point_error
+from zsdata.metrics import bad_pixel_rate, d1, disparity_edges, end_point_error, reconstruction_error, reconstruction_maps
 
 
 def plain_metrics(prediction, disparity, valid, threshold):
@@ -114,3 +115,58 @@ def test_edges_of_what_does_not_fit_are_refused():
     for wrong in ({"jump_px": 0}, {"reach_px": 0}, {"margin_px": -1}):
         with pytest.raises(ValueError, match="jump_px is positive"):
             disparity_edges(disparity, valid, **wrong)
+
+
+def pair_with_label(seed, batch=2, height=9, width=14):
+    generator = np.random.default_rng(seed)
+    left, right = generator.uniform(0, 255, (2, batch, 3, height, width)).astype(np.float32)
+    disparity = generator.uniform(0, 6, (batch, 1, height, width)).astype(np.float32)
+    return left, right, disparity, generator.random(disparity.shape) < 0.6
+
+
+def test_the_reconstruction_errors_are_those_of_the_paper_as_plain_loops():
+    left, right, disparity, mask = pair_with_label(0)
+    found = reconstruction_error(*(torch.from_numpy(array) for array in (left, right, disparity, mask)))
+    whole = reconstruction_error(*(torch.from_numpy(array) for array in (left, right, disparity)))
+    for i in range(len(left)):
+        photometric, abs_err, dissimilarity = (
+            oracles_loss.photometric_loss(left[i] / 255.0, right[i] / 255.0, disparity[i, 0], beta) for beta in (0.85, 0.0, 1.0)
+        )
+        for means, counted in ((found, mask[i, 0]), (whole, np.ones_like(mask[i, 0]))):
+            assert float(means.abs_err[i]) == pytest.approx(abs_err[counted].mean(), abs=1e-6)
+            assert float(means.ssim[i]) == pytest.approx(1 - 2 * dissimilarity[counted].mean(), abs=1e-5)
+            assert float(means.photometric[i]) == pytest.approx(photometric[counted].mean(), abs=1e-5)
+
+
+def test_a_photo_that_is_its_own_right_view_is_reconstructed_exactly():
+    left = torch.from_numpy(pair_with_label(1)[0])
+    means = reconstruction_error(left, left, torch.zeros_like(left[:, :1]))
+    assert means.abs_err.tolist() == [0, 0]
+    assert means.ssim.tolist() == pytest.approx([1, 1], abs=1e-6)
+    assert means.photometric.tolist() == pytest.approx([0, 0], abs=1e-6)
+
+
+def test_the_errors_of_one_image_do_not_reach_the_others():
+    left, right, disparity, mask = (torch.from_numpy(array) for array in pair_with_label(2, batch=3))
+    mask[1] = False
+    means = reconstruction_error(left, right, disparity, mask)
+    for i in (0, 2):
+        alone = reconstruction_error(left[i : i + 1], right[i : i + 1], disparity[i : i + 1], mask[i : i + 1])
+        assert [float(values[i]) for values in means] == [float(values) for values in alone]
+    assert all(math.isnan(values[1]) for values in means)
+
+
+def test_what_does_not_fit_for_a_reconstruction_is_named():
+    left, right, disparity, mask = (torch.from_numpy(array) for array in pair_with_label(3))
+    with pytest.raises(ValueError, match=r"\[2, 3, 9, 14\] and \[2, 3, 9, 13\]"):
+        reconstruction_maps(left, right[..., 1:], disparity)
+    with pytest.raises(ValueError, match="at least 4 px"):
+        reconstruction_maps(left[..., :3, :], right[..., :3, :], disparity[..., :3, :])
+    with pytest.raises(ValueError, match=r"disparity \[B, 1, H, W\]"):
+        reconstruction_maps(left, right, disparity[..., 1:])
+    with pytest.raises(ValueError, match="finite everywhere"):
+        reconstruction_maps(left, right, torch.where(mask, disparity, math.nan))
+    with pytest.raises(ValueError, match=r"\[2, 1, 9, 13\] and \[2, 1, 9, 14\]"):
+        reconstruction_error(left, right, disparity, mask[..., 1:])
+    with pytest.raises(TypeError, match="float32"):
+        reconstruction_error(left, right, disparity, mask.float())
