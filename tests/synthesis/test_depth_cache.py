@@ -34,6 +34,12 @@ def key(number):
     return photo_digest(b"photo %d" % number)
 
 
+def loaded(cache, number, rows=None):
+    found = cache.load(key(number), rows)
+    assert found is not None
+    return found
+
+
 def is_stored(found, number, height=40, width=30):
     inverse_depth, confidence, consistency = maps(number, height, width)
     return (
@@ -92,7 +98,7 @@ def test_rows_are_widened_to_whole_bands(tmp_path_factory, height, width, data):
     stop = data.draw(st.integers(first + 1, height))
     cache = DepthCache(tmp_path_factory.mktemp("rows"), PLENTY, "estimator 1")
     assert cache.store(key(0), *maps(0, height, width))
-    found = cache.load(key(0), (first, stop))
+    found = loaded(cache, 0, (first, stop))
     inverse_depth, confidence, consistency = maps(0, height, width)
     rows = slice(found.first_row, found.first_row + len(found.inverse_depth))
     assert rows.start <= first < stop <= rows.stop <= height
@@ -103,14 +109,14 @@ def test_rows_are_widened_to_whole_bands(tmp_path_factory, height, width, data):
 
 def test_a_header_longer_than_the_first_read(cache):
     assert cache.store(key(0), *maps(0, 9000, 2))
-    found = cache.load(key(0), (8500, 8600))
+    found = loaded(cache, 0, (8500, 8600))
     assert np.array_equal(found.inverse_depth[8500 - found.first_row :][:100], maps(0, 9000, 2)[0][8500:8600])
 
 
 def test_views_that_are_not_contiguous_are_stored_as_they_look(cache):
     inverse_depth, confidence, consistency = maps(3)
     cache.store(key(3), inverse_depth.T[::-1], confidence.T[::-1], consistency)
-    found = cache.load(key(3))
+    found = loaded(cache, 3)
     assert np.array_equal(found.inverse_depth, inverse_depth.T[::-1]) and np.array_equal(found.confidence, confidence.T[::-1])
 
 
@@ -161,7 +167,7 @@ def test_a_cut_at_any_length_is_a_miss_and_removes_the_entry(cache):
 def test_damage_in_rows_that_are_not_asked_for_leaves_the_others_right(cache):
     path, data = stored_small(cache)
     write(path, data[:-1] + bytes([data[-1] ^ 1]))  # confidence of the last row
-    found = cache.load(key(1), (0, BAND_ROWS))
+    found = loaded(cache, 1, (0, BAND_ROWS))
     assert np.array_equal(found.confidence, maps(1, 20, 6)[1][:BAND_ROWS])
     assert cache.load(key(1), (BAND_ROWS, 20)) is None
 
@@ -182,7 +188,7 @@ def test_something_else_in_an_entrys_place_is_a_miss_and_replaced(cache, make):
     path, _ = stored_small(cache)
     os.unlink(path)
     make(path)
-    assert cache.load(key(1)) is None
+    assert cache.load(key(1)) is None and not os.path.lexists(path)
     assert cache.store(key(1), *maps(1)) and is_stored(cache.load(key(1)), 1)
 
 
@@ -330,9 +336,10 @@ def test_a_smaller_bound_removes_nothing(cache):
 
 def test_a_full_disk_is_said_once_and_the_rest_goes_on(cache, monkeypatch, warnings_said):
     cache.store(key(1), *maps(1))
-    pack_entry = cache_module.pack_entry
+    pack_entry, tried = cache_module.pack_entry, []
 
     def full_disk(*args):
+        tried.append(args)
         yield next(pack_entry(*args))
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -340,6 +347,7 @@ def test_a_full_disk_is_said_once_and_the_rest_goes_on(cache, monkeypatch, warni
     with monkeypatch.context() as patch:
         patch.setattr(cache_module, "pack_entry", full_disk)
         assert [cache.store(key(number), *maps(number)) for number in (2, 3)] == [False, False]
+    assert len(tried) == 1  # not again for every photo
     (said,) = warnings_said()
     assert cache.folder in said and "No space left on device" in said and "free space" in said
     assert files(cache.folder, ".tmp") == [] and held_bytes(cache.folder) == held == counted(cache.folder)
@@ -388,17 +396,17 @@ def test_an_interrupted_store_leaves_nothing_behind(cache, monkeypatch):
 
 
 def test_the_file_of_a_writer_that_lives_is_left_to_it(cache, monkeypatch):
-    pack_entry, seen = cache_module.pack_entry, []
+    pack_entry, seen, before = cache_module.pack_entry, [], held_bytes(cache.folder)
 
     def interleaved(*args):
         for part in pack_entry(*args):
             DepthCache(cache.folder, PLENTY, "estimator 1")  # counts, and removes what nobody writes any more
-            seen.append((len(files(cache.folder, ".tmp")), held_bytes(cache.folder) - counted(cache.folder)))
+            seen.append((len(files(cache.folder, ".tmp")), held_bytes(cache.folder) - before))
             yield part
 
     monkeypatch.setattr(cache_module, "pack_entry", interleaved)
-    assert cache.store(key(1), *maps(1))
-    assert seen == [(1, 0)] * 4 and is_stored(cache.load(key(1)), 1)
+    assert cache.store(key(1), *maps(1, *SIZE))
+    assert seen == [(1, 9 * 4096 + 256)] * 4 and is_stored(cache.load(key(1)), 1, *SIZE)
 
 
 # Arguments
