@@ -102,3 +102,16 @@ def test_weights_that_mean_nothing_are_refused(weights):
 def test_an_index_outside_the_epoch_is_refused(index):
     with pytest.raises(IndexError, match="epoch of 12"):
         EpochPlan(0, ("a",), (5,), (12,)).choose(0, index)
+
+
+@given(st.integers(1, 5), st.integers(1, 60), st.integers(0, 3))
+def test_the_views_of_a_photo_stand_together_and_every_photo_gives_as_many(views, samples, epoch):
+    photos = -(-samples // views)
+    plan = EpochPlan(0, ("a", "b"), (7, 30), quotas_for((7, 30), [0.5, 0.5], photos), views, samples)
+    choices = [plan.choose(epoch, i) for i in range(plan.epoch_size)]
+    assert len(choices) == samples
+    groups = [choices[first : first + views] for first in range(0, samples, views)]
+    assert all(len(set(group)) == 1 for group in groups)
+    once = EpochPlan(0, ("a", "b"), (7, 30), plan.quotas)
+    assert [group[0] for group in groups] == [once.choose(epoch, i) for i in range(photos)]
+    assert len({plan.spare(epoch, index, 0) for index in range(min(views, samples))}) == 1

@@ -9,8 +9,9 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from tests.scenes import grey_fill, jpeg, layered_depth, photo, photo_tar, write_tar
+from tests.scenes import grey_fill, jpeg, layered_depth, photo, photo_tar, png, write_tar
 from zsdata import AdaptiveDisparity, AugmentConfig, ImageSource, StereoBatch, UniformDisparity, ZeroStereoStream
+from zsdata.synthesis.view import ViewConfig
 
 SIZE = (64, 96)
 
@@ -343,3 +344,106 @@ def test_a_pair_says_which_photos_it_stands_in_for_in_any_process(tmp_path):
     pairs = list(DataLoader(open_stream(tar), batch_size=None, num_workers=1))
     replaced = [key for pair in pairs for _, _, key, _ in pair.meta["replaced"]]
     assert len(pairs) == 4 and set(replaced) == {"page"}
+
+
+class CountingDepth:
+    """A depth estimator that counts its calls and has a name in a cache."""
+
+    cache_name = "layered v1"
+
+    def __init__(self):
+        self.calls = 0
+
+    def __call__(self, images):
+        self.calls += 1
+        return layered_depth(images)
+
+
+def test_several_views_of_a_photo_differ_and_cost_one_estimate(tar):
+    depth = CountingDepth()
+    stream = open_stream(tar, depth=depth, views_per_image=3)
+    pairs = list(stream)
+    assert len(pairs) == 36 == len({fingerprint(pair) for pair in pairs})
+    assert depth.calls == 24, "each photo and its mirror image, once"
+    for first in range(0, 36, 3):
+        views = pairs[first : first + 3]
+        assert len({pair.meta["key"] for pair in views}) == 1
+        assert len({pair.meta["disparity_scale"] for pair in views}) == 3
+    assert fingerprint(stream.replay(0, 17)) == fingerprint(pairs[17])
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
+@pytest.mark.parametrize("workers", [0, 2])
+def test_several_views_are_the_same_however_they_are_made(tar, workers):
+    plain = by_index(open_stream(tar, views_per_image=3))
+    batches = list(DataLoader(open_stream(tar, views_per_image=3), batch_size=4, num_workers=workers))
+    assert by_index(batch[i] for batch in batches for i in range(len(batch))) == plain
+    with open_stream(tar, views_per_image=3).loader(4, num_workers=workers) as loader:  # batches that cut through a photo's views
+        assert by_index(batch[i] for batch in loader for i in range(4)) == plain
+
+
+def test_an_epoch_of_several_views_has_the_size_that_was_asked_for(tar):
+    stream = open_stream(tar, views_per_image=4, epoch_size=10)
+    assert len(list(stream)) == len(stream) == 10
+
+
+@pytest.mark.parametrize("options", [{}, {"views_per_image": 2}], ids=["one view", "two views"])
+def test_the_depth_cache_changes_no_byte_and_saves_the_estimates(tar, tmp_path, options):
+    without = by_index(open_stream(tar, depth=CountingDepth(), **options))
+    for epoch_is_cached in (False, True):
+        depth = CountingDepth()
+        assert by_index(open_stream(tar, depth=depth, depth_cache=tmp_path / "depth", **options)) == without
+        assert depth.calls == (0 if epoch_is_cached else 24)
+
+
+def test_workers_share_the_depth_cache(tar, plain, tmp_path):
+    depth = CountingDepth()
+    for _ in range(2):
+        with open_stream(tar, depth=depth, depth_cache=tmp_path / "depth").loader(3, num_workers=2) as loader:
+            pairs = [batch[i] for batch in loader for i in range(3)]
+        assert {(pair.meta["epoch"], pair.meta["index"]) for pair in pairs} == plain.keys()
+        assert by_index(pairs) == plain
+    entries = [path for path in (tmp_path / "depth").rglob("*") if path.is_file() and path.stat().st_size > 120 * 160 * 3]
+    assert len(entries) == 12
+
+
+def test_a_damaged_depth_cache_is_mended(tar, plain, tmp_path):
+    list(open_stream(tar, depth=CountingDepth(), depth_cache=tmp_path))
+    for path in tmp_path.rglob("*"):
+        if path.is_file() and path.stat().st_size > 120 * 160 * 3:
+            data = bytearray(path.read_bytes())
+            data[len(data) // 2] ^= 1
+            path.write_bytes(data)
+    depth = CountingDepth()
+    assert by_index(open_stream(tar, depth=depth, depth_cache=tmp_path)) == plain and depth.calls > 0
+    depth = CountingDepth()
+    assert by_index(open_stream(tar, depth=depth, depth_cache=tmp_path)) == plain and depth.calls == 0
+
+
+def test_a_cache_for_an_estimator_without_a_name_is_refused(tar, tmp_path):
+    with pytest.raises(ValueError, match="cache_name"):
+        open_stream(tar, depth_cache=tmp_path)
+
+
+def test_without_a_size_a_pair_is_the_whole_photo(tmp_path):
+    sizes = [(120, 160), (90, 70), (64, 200)]
+    tar = write_tar(tmp_path / "sizes.tar", {f"{i}.png": png(photo(i, *size)) for i, size in enumerate(sizes)})
+    stream = open_stream(tar, size=None, augmentation=AugmentConfig.none())
+    pairs = {pair.meta["key"]: pair for pair in stream}
+    for i, (height, width) in enumerate(sizes):
+        pair = pairs[str(i)]
+        assert torch.equal(pair.left, torch.from_numpy(photo(i, height, width)).permute(2, 0, 1).float())
+        assert pair.right.shape == (3, height, width) and pair.masks.inpaint.shape == (1, height, width)
+        assert 0 < pair.disparity.max() <= 0.2 * width
+    with stream.loader(1, num_workers=2) as loader:
+        assert by_index(batch[0] for batch in loader) == by_index(open_stream(tar, size=None, augmentation=AugmentConfig.none()))
+    with pytest.raises(ValueError, match="batch_size is 1; got 2"):
+        stream.loader(2)
+
+
+def test_photos_decoded_at_a_fraction_give_the_same_pairs_with_and_without_a_depth_cache(tmp_path):
+    tar = photo_tar(tmp_path / "large.tar", 4, height=512, width=768)
+    options = {"depth": CountingDepth(), "view": ViewConfig(min_scale=-3, max_scale=-2)}
+    plain = by_index(open_stream(tar, **options))
+    for _ in range(2):
+        assert by_index(open_stream(tar, depth_cache=tmp_path / "depth", **options)) == plain

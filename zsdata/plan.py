@@ -61,30 +61,36 @@ def _mix(value: int) -> int:
 class EpochPlan:
     """The order of photos while one set of sources is in use.
 
-    Every source gives a fixed number of samples per epoch (its `quota`) and goes through all its photos before it repeats one; the
-    sources are mixed by one permutation of the epoch.
+    Every source gives a fixed number of photos per epoch (its `quota`) and goes through all its photos before it repeats one; the
+    sources are mixed by one permutation of the epoch. Samples k i to k i + k - 1 are the k views of one photo, so that whoever makes them
+    one after another decodes it once.
 
     Args:
         seed: of the whole stream.
         names: of the sources; a source keeps its order whatever stands beside it.
         sizes: photos per source.
-        quotas: samples per source and epoch.
+        quotas: photos per source and epoch.
+        views_per_image: k.
+        samples: per epoch, where the last photo gives fewer views than the others.
     """
 
     seed: int
     names: tuple[str, ...]
     sizes: tuple[int, ...]
     quotas: tuple[int, ...]
+    views_per_image: int = 1
+    samples: int | None = None
 
     @property
     def epoch_size(self) -> int:
-        return sum(self.quotas)
+        """Samples per epoch."""
+        return self.samples if self.samples is not None else sum(self.quotas) * self.views_per_image
 
     def choose(self, epoch: int, index: int) -> Choice:
         """The photo of sample `index` of `epoch`."""
         if not 0 <= index < self.epoch_size:
             raise IndexError(f"sample {index} of an epoch of {self.epoch_size}")
-        place = Shuffle(self.epoch_size, self.seed, "mix", epoch)(index)
+        place = Shuffle(sum(self.quotas), self.seed, "mix", epoch)(index // self.views_per_image)
         ends = list(accumulate(self.quotas))
         source = bisect_right(ends, place)
         turn = epoch * self.quotas[source] + place - (ends[source] - self.quotas[source])
@@ -99,30 +105,28 @@ class EpochPlan:
         others = self.sizes[chosen.source] - 1
         if attempt >= others:
             return None
-        other = Shuffle(others, self.seed, "spare", epoch, index)(attempt)
+        other = Shuffle(others, self.seed, "spare", epoch, index // self.views_per_image)(attempt)
         return Choice(chosen.source, other + (other >= chosen.member))
 
 
-def quotas_for(sizes: Sequence[int], weights: Sequence[float | None], epoch_size: int | None) -> tuple[int, ...]:
-    """Samples per source and epoch.
+def quotas_for(sizes: Sequence[int], weights: Sequence[float | None], photos: int | None) -> tuple[int, ...]:
+    """Photos per source and epoch.
 
     Args:
         sizes: photos per source.
         weights: relative shares; a source without one weighs as many photos as it has. Either all have one or none.
-        epoch_size: samples per epoch, shared out by largest remainder; None is one exact pass over all photos, whatever the weights.
+        photos: per epoch, shared out by largest remainder; None is one exact pass over all photos, whatever the weights.
     """
-    if epoch_size is None:
+    if photos is None:
         return tuple(sizes)
-    if epoch_size < 1:
-        raise ValueError(f"epoch_size is a number of samples, 1 or more, or None for one exact pass over the photos; got {epoch_size}")
     if any(weight is None for weight in weights) and any(weight is not None for weight in weights):
         raise ValueError(f"give every source a weight or none; got {list(weights)}")
     shares = [float(size) if weight is None else float(weight) for size, weight in zip(sizes, weights, strict=True)]
     if not all(math.isfinite(share) and share >= 0 for share in shares) or not sum(shares) > 0:
         raise ValueError(f"weights are finite, >= 0 and not all 0; got {list(weights)}")
-    exact = [epoch_size * share / sum(shares) for share in shares]
+    exact = [photos * share / sum(shares) for share in shares]
     quotas = [math.floor(value) for value in exact]
     by_remainder = sorted(range(len(sizes)), key=lambda i: (quotas[i] - exact[i], i))
-    for i in by_remainder[: epoch_size - sum(quotas)]:
+    for i in by_remainder[: photos - sum(quotas)]:
         quotas[i] += 1
     return tuple(quotas)

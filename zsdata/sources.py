@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import math
 import os
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
@@ -44,12 +45,17 @@ class Schedule:
 
     Args:
         sources: as `ZeroStereoStream` takes them: urls, a list of urls, {name: ImageSource or urls}, or {first epoch: any of these}.
-        seed, epoch_size: as `ZeroStereoStream` takes them.
+        seed, epoch_size, views_per_image: as `ZeroStereoStream` takes them.
     """
 
-    def __init__(self, sources: Any, seed: int, epoch_size: int | None) -> None:
+    def __init__(self, sources: Any, seed: int, epoch_size: int | None, views_per_image: int = 1) -> None:
+        if epoch_size is not None and epoch_size < 1:
+            raise ValueError(f"epoch_size is a number of samples, 1 or more, or None for one exact pass over the photos; got {epoch_size}")
+        if views_per_image < 1:
+            raise ValueError(f"views_per_image is 1 or more; got {views_per_image}")
         self._seed = seed
         self._epoch_size = epoch_size
+        self._views = views_per_image
         self._manifests: dict[str, Manifest] = {}
         by_epoch = _by_epoch(sources)
         self._starts = sorted(by_epoch)
@@ -77,7 +83,7 @@ class Schedule:
     def digest(self) -> str:
         """Changes with any photo, source name, quota or epoch at which sources are swapped."""
         content = [
-            (start, sources.names, sources.plan.quotas, [manifest.digest for manifest in sources.manifests])
+            (start, sources.names, sources.plan.quotas, sources.plan.epoch_size, [manifest.digest for manifest in sources.manifests])
             for start, sources in zip(self._starts, self._sets, strict=True)
         ]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
@@ -88,8 +94,9 @@ class Schedule:
         sizes = tuple(len(manifest) for manifest in manifests)
         if self._epoch_size is None and any(source.weight is not None for source in named.values()):
             logger.warning("without epoch_size an epoch is one pass over the photos and the sources' weights change nothing; set it")
-        quotas = quotas_for(sizes, [source.weight for source in named.values()], self._epoch_size)
-        return SourceSet(tuple(named), manifests, EpochPlan(self._seed, tuple(named), sizes, quotas))
+        photos = None if self._epoch_size is None else math.ceil(self._epoch_size / self._views)
+        quotas = quotas_for(sizes, [source.weight for source in named.values()], photos)
+        return SourceSet(tuple(named), manifests, EpochPlan(self._seed, tuple(named), sizes, quotas, self._views, self._epoch_size))
 
     def _manifest(self, urls: Any) -> Manifest:
         key = repr(urls)

@@ -24,6 +24,8 @@ from zsdata.sample import StereoBatch
 from zsdata.sources import Schedule
 from zsdata.synthesis.depth import DepthEstimator
 from zsdata.synthesis.depth.builtin import warn_once
+from zsdata.synthesis.depth.cache import DepthCache
+from zsdata.synthesis.depth.identity import depth_identity
 from zsdata.synthesis.disparity import AdaptiveDisparity, UniformDisparity
 from zsdata.synthesis.inpaint import Inpainter, load_inpainter
 from zsdata.synthesis.synthesizer import SynthesisConfig
@@ -33,6 +35,7 @@ from zsdata.worker import Prepared, Recipe, Worker
 logger = logging.getLogger("zsdata")
 
 SMALLEST_CROP_PX = 32
+DEPTH_CACHE_BYTES = 50_000_000_000  # about 50,000 photos of 480x640
 
 
 class ZeroStereoStream(IterableDataset):
@@ -49,12 +52,17 @@ class ZeroStereoStream(IterableDataset):
         sources: tars of photos: a path, url or pattern ("shards/{000..099}.tar"), a list of such, named and weighted sources
             ({"indoor": ImageSource("in.tar", weight=0.7), "street": ImageSource("out.tar", weight=0.3)}), or any of these by the epoch
             from which they are used ({0: "first.tar", 5: "second.tar"}).
-        size: (height, width) of the pairs, in pixels.
+        size: (height, width) of the pairs, in pixels; None gives every pair its photo's own size: the whole photo as it is.
         depth: "builtin", a Hub id or folder in the transformers format, or a callable (see `load_depth`).
         inpaint: "builtin", "background", a Hub id or folder in the diffusers format, or a callable (see `load_inpainter`).
         disparity: how far apart the cameras stand: AdaptiveDisparity (the paper's) or UniformDisparity (MfS-Stereo's).
         seed: an integer >= 0.
         epoch_size: samples per epoch; None is one exact pass over the photos, whatever their sources' weights.
+        views_per_image: samples that are made from one photo, one after another: each a view, disparity and augmentation of its own. The
+            photo is decoded, and its depth estimated, once for all of them, and the pairs of a batch resemble each other more.
+        depth_cache: a folder that keeps the depth of every photo, so that a slow estimator is paid once per photo and not once per epoch.
+            Any number of workers, ranks and runs may share it.
+        depth_cache_bytes: the most that the folder may hold; 3 bytes per pixel of each photo. A full cache keeps what it has.
         view, synthesis, augmentation: configurations of these steps; `AugmentConfig.none()` leaves the pairs as they are.
         budget: how many photos may be refused before the run stops.
 
@@ -66,12 +74,15 @@ class ZeroStereoStream(IterableDataset):
         self,
         sources: Any,
         *,
-        size: tuple[int, int] = (384, 512),
+        size: tuple[int, int] | None = (384, 512),
         depth: str | os.PathLike[str] | DepthEstimator = "builtin",
         inpaint: str | os.PathLike[str] | Inpainter = "builtin",
         disparity: AdaptiveDisparity | UniformDisparity | None = None,
         seed: int = 0,
         epoch_size: int | None = None,
+        views_per_image: int = 1,
+        depth_cache: str | os.PathLike[str] | None = None,
+        depth_cache_bytes: int = DEPTH_CACHE_BYTES,
         view: ViewConfig | None = None,
         synthesis: SynthesisConfig | None = None,
         augmentation: AugmentConfig | None = None,
@@ -80,9 +91,10 @@ class ZeroStereoStream(IterableDataset):
         super().__init__()
         if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
             raise ValueError(f"seed is an integer >= 0; got {seed!r}")
-        if len(size) != 2 or not all(isinstance(side, int) and side >= SMALLEST_CROP_PX for side in size):
-            raise ValueError(f"size is (height, width) in pixels, each {SMALLEST_CROP_PX} or more; got {size!r}")
-        self._schedule = Schedule(sources, seed, epoch_size)
+        if size is not None and (len(size) != 2 or not all(isinstance(side, int) and side >= SMALLEST_CROP_PX for side in size)):
+            raise ValueError(f"size is (height, width) in pixels, each {SMALLEST_CROP_PX} or more, or None for whole photos; got {size!r}")
+        self._schedule = Schedule(sources, seed, epoch_size, views_per_image)
+        self._views_per_image = views_per_image
         self._revision = 0
         self._told_problems = 0
         self._tell_problems()
@@ -90,14 +102,17 @@ class ZeroStereoStream(IterableDataset):
         self._augmentation = augmentation if augmentation is not None else AugmentConfig()
         self._budget = budget if budget is not None else FailureBudget()
         inpainter = load_inpainter(self._inpaint) if callable(inpaint) or self._inpaint in ("builtin", "background") else None
+        depth = depth if callable(depth) else os.fspath(depth)
+        synthesis = synthesis if synthesis is not None else SynthesisConfig()
         self._recipe = Recipe(
             seed=seed,
-            size=(int(size[0]), int(size[1])),
+            size=None if size is None else (int(size[0]), int(size[1])),
             schedule=self._schedule,
-            depth=depth if callable(depth) else os.fspath(depth),
+            depth=depth,
+            depth_cache=_open_cache(depth_cache, depth_cache_bytes, depth, synthesis),
             disparity=disparity if disparity is not None else AdaptiveDisparity(),
             view=view if view is not None else ViewConfig(),
-            synthesis=synthesis if synthesis is not None else SynthesisConfig(),
+            synthesis=synthesis,
             inpainter_needs=tuple(getattr(inpainter, "needs", ())),
         )
         if self._recipe.depth == "builtin":
@@ -120,11 +135,13 @@ class ZeroStereoStream(IterableDataset):
     def __iter__(self) -> Iterator[StereoBatch]:
         """The finished pairs of an epoch, on the CPU, without a batch axis; from where the last loop stopped."""
         info = get_worker_info()
-        first, step = (info.id, info.num_workers) if info else (0, 1)
+        share, shares = (info.id, info.num_workers) if info else (0, 1)
         epoch = self._epoch
-        for index in range(self._samples + first, self.epoch_size(epoch), step):
+        for index in range(self._samples, self.epoch_size(epoch)):
+            if index // self._views_per_image % shares != share:  # the views of a photo stay together
+                continue
             pair = self._make(epoch, index)
-            self._samples += step
+            self._samples = index + 1
             yield pair
             if self._epoch != epoch:
                 return  # another loop or a set_epoch has moved the stream on
@@ -177,6 +194,8 @@ class ZeroStereoStream(IterableDataset):
         """
         if micro_batch < 1:
             raise ValueError(f"micro_batch is 1 or more; got {micro_batch}")
+        if self._recipe.size is None and batch_size != 1:
+            raise ValueError(f"whole photos (size=None) differ in size and come one at a time: batch_size is 1; got {batch_size}")
         return StereoLoader(
             worker=self._worker,
             finisher=self._finisher(torch.device(device), micro_batch),
@@ -250,6 +269,7 @@ class ZeroStereoStream(IterableDataset):
         recipe = self._recipe
         configuration = {
             "size": recipe.size,
+            "views_per_image": self._views_per_image,
             "depth": _name_of(recipe.depth),
             "inpaint": _name_of(self._inpaint),
             "disparity": [type(recipe.disparity).__name__, asdict(recipe.disparity)],
@@ -259,6 +279,15 @@ class ZeroStereoStream(IterableDataset):
         }
         digest = hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest()
         return Position(seed=recipe.seed, epoch=epoch, samples=samples, manifest=self._schedule.digest, configuration=digest)
+
+
+def _open_cache(
+    folder: str | os.PathLike[str] | None, max_bytes: int, depth: str | DepthEstimator, synthesis: SynthesisConfig
+) -> DepthCache | None:
+    if folder is None:
+        return None
+    confidence = "flip confidence" if synthesis.flip_confidence else "no confidence"
+    return DepthCache(folder, max_bytes, f"{depth_identity(depth)}, {confidence}")
 
 
 def _name_of(step: Any) -> str:

@@ -297,6 +297,6 @@ def test_the_extension_is_that_of_the_content():
 def test_decoding_looks_at_the_picture_once(monkeypatch):
     calls = []
     decode = jpeg.decode_color
-    monkeypatch.setattr(jpeg, "decode_color", lambda data: calls.append(1) or decode(data))
+    monkeypatch.setattr(jpeg, "decode_color", lambda *arguments: calls.append(1) or decode(*arguments))
     decode_rgb(encode(picture(200, 300)))
     assert len(calls) == 1

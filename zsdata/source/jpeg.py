@@ -81,12 +81,18 @@ class Jpeg:
         one_scan = not frame.progressive and data[start] == frame.components
         return Jpeg(data, frame.width, frame.height, frame.components, 0 if one_scan else frame.coefficient_bytes, orientation, end)
 
-    def decode(self) -> np.ndarray:
-        """uint8 [height, width, 3] RGB; grey and CMYK (inverted, as Adobe stores it) are converted."""
-        image = decode_color(self.data)
-        if self.components < 4 and (image[-1, -1] == 128).all() and self._lacks_scan_data(image):
+    def decode(self, reduction: int = 1) -> np.ndarray:
+        """uint8 [height, width, 3] RGB; grey and CMYK (inverted, as Adobe stores it) are converted.
+
+        Args:
+            reduction: 1, 2, 4 or 8: decoded at one part in so many of each side, rounded up.
+        """
+        image = decode_color(self.data, reduction)
+        if self.components < 4 and (image[-1, -1] == 128).all() and self._lacks_scan_data(image, reduction):
             raise BadPhoto("truncated: JPEG data are missing before its end")
-        if self.data.find(_ZEROS, self.scan, self._scan_end) >= 0 and (self._lacks_scan_data(image) or self._has_surplus_scan_data(image)):
+        if self.data.find(_ZEROS, self.scan, self._scan_end) >= 0 and (
+            self._lacks_scan_data(image, reduction) or self._has_surplus_scan_data(image, reduction)
+        ):
             raise BadPhoto("damaged: zeros among the JPEG data")
         return image
 
@@ -94,19 +100,19 @@ class Jpeg:
     def _scan_end(self) -> int:
         return self.data.find(_END, self.scan)
 
-    def _lacks_scan_data(self, image: np.ndarray) -> bool:
+    def _lacks_scan_data(self, image: np.ndarray, reduction: int) -> bool:
         """Whether OpenCV ran out of data and filled up with grey (128).
 
         It says so to stderr only. But surplus data before the end marker change nothing in a whole JPEG, and are taken for the missing
         blocks in another.
         """
         surplus = self.data[: self._scan_end] + bytes(range(1, 200, 2)) + self.data[self._scan_end :]
-        return not np.array_equal(image, decode_color(surplus))
+        return not np.array_equal(image, decode_color(surplus, reduction))
 
-    def _has_surplus_scan_data(self, image: np.ndarray) -> bool:
+    def _has_surplus_scan_data(self, image: np.ndarray, reduction: int) -> bool:
         """Whether the picture was complete before its data ended, as the last bytes change nothing; a flat last row cannot tell."""
         without_last = self.data[: self._scan_end - 64] + self.data[self._scan_end :]
-        return bool(np.ptp(image[-1], axis=0).any()) and np.array_equal(image, decode_color(without_last))
+        return bool(np.ptp(image[-1], axis=0).any()) and np.array_equal(image, decode_color(without_last, reduction))
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,20 @@ from zsdata.faults import BadPhoto
 
 BAND_PX = 1 << 20  # pixels blended at a time
 
+_REDUCED = {1: 0, 2: 16, 4: 32, 8: 64}  # the bits of cv2.IMREAD_REDUCED_COLOR_2, _4 and _8
 _RGB = getattr(cv2, "IMREAD_COLOR_RGB", None)  # OpenCV 4.11 and later
 
 
-def decode_color(data: bytes) -> np.ndarray:
-    """Any image without alpha to uint8 [H, W, 3] RGB, as stored (EXIF not applied)."""
+def decode_color(data: bytes, reduction: int = 1) -> np.ndarray:
+    """Any image without alpha to uint8 [H, W, 3] RGB, as stored (EXIF not applied).
+
+    Args:
+        reduction: 1, 2, 4 or 8: each side is decoded at one part in so many. A JPEG's decoder then leaves out the finer frequencies.
+    """
+    flags = _REDUCED[reduction] | cv2.IMREAD_IGNORE_ORIENTATION
     if _RGB is not None:
-        return _decode(data, _RGB | cv2.IMREAD_IGNORE_ORIENTATION)
-    image = _decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        return _decode(data, _RGB | flags)
+    image = _decode(data, cv2.IMREAD_COLOR | flags)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
 
 

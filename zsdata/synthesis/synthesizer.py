@@ -9,25 +9,31 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from zsdata.meter import Meter
 from zsdata.synthesis.confidence import flip_confidence, flip_consistency, normalize_inverse_depth
 from zsdata.synthesis.depth import DepthEstimator
 from zsdata.synthesis.disparity import SMALLEST_DISPARITY_PX, dilate_disparity, sharpen_disparity
 from zsdata.synthesis.view import View, view_map
 from zsdata.synthesis.warp import forward_warp
 
+NEAREST = 65_535  # the inverse depth of the photo's nearest point; a step is 1/500 px of the largest disparity that any photo is given
+CERTAIN = 255  # the confidence of a label that is trusted entirely
+
 
 class DepthMaps(NamedTuple):
-    """What is known of a photo's depth, whatever is drawn from it.
+    """What is known of a photo's depth, whatever is drawn from it; as whole numbers, so that it can be kept and comes back bit for bit.
 
     Attributes:
-        inverse_depth: float32 [B, 1, h, w] in [0, 1].
-        confidence: float32 [B, 1, h, w] in [0, 1].
+        inverse_depth: uint16 [B, 1, h, w], 0 (farthest) to NEAREST.
+        confidence: uint8 [B, 1, h, w], 0 to CERTAIN.
         consistency: float64 [B], the mean flip consistency before normalisation.
+        first_row: of the maps in the photo, where they are a part of it.
     """
 
     inverse_depth: Tensor
     confidence: Tensor
     consistency: Tensor
+    first_row: int = 0
 
 
 INPAINT_CONTEXT_PX = 32  # a hole at the crop's right edge is filled from its background, which begins beyond that edge
@@ -68,30 +74,35 @@ def estimate_depth(depth: DepthEstimator, photos: Tensor, config: SynthesisConfi
         photos: float32 [B, 3, h, w], RGB 0..255.
     """
     inverse_depth = normalize_inverse_depth(_checked(depth(photos), photos))
-    if not config.flip_confidence:
-        return DepthMaps(inverse_depth, torch.ones_like(inverse_depth), torch.ones(len(photos), dtype=torch.float64))
-    mirrored = normalize_inverse_depth(_checked(depth(photos.flip(-1)), photos)).flip(-1)
-    confidence = flip_confidence(inverse_depth, mirrored)
-    return DepthMaps(inverse_depth, confidence, flip_consistency(inverse_depth, mirrored))
+    if config.flip_confidence:
+        mirrored = normalize_inverse_depth(_checked(depth(photos.flip(-1)), photos)).flip(-1)
+        confidence, consistency = flip_confidence(inverse_depth, mirrored), flip_consistency(inverse_depth, mirrored)
+    else:
+        confidence, consistency = torch.ones_like(inverse_depth), torch.ones(len(photos), dtype=torch.float64)
+    return DepthMaps(
+        (inverse_depth * NEAREST).round_().int().to(torch.uint16), (confidence * CERTAIN).round_().int().to(torch.uint8), consistency
+    )
 
 
-def synthesize(
-    photo_view: Tensor, depth: DepthMaps, view: View, photo_size: tuple[int, int], scale: float, config: SynthesisConfig
-) -> Synthesized:
+def synthesize(photo_view: Tensor, depth: DepthMaps, view: View, scale: float, config: SynthesisConfig, meter: Meter) -> Synthesized:
     """The right view of one photo's view, with holes, and both masks.
 
     Args:
         photo_view: float32 [1, 3, height, width], the view's part of the photo, margin included.
-        depth: of the whole photo.
+        depth: of the photo, at least the rows that the view shows.
         view: where the crop lies in the photo.
-        photo_size: (height, width) of the whole photo.
         scale: disparity of the photo's nearest point as a share of its width.
+        meter: counts the seconds of each step.
     """
-    largest_px = scale * photo_size[1] * view.scale_x
-    disparity = view_map(depth.inverse_depth, view, photo_size) * largest_px
-    disparity = sharpen_disparity(dilate_disparity(disparity, config.dilate_px)).clamp(min=SMALLEST_DISPARITY_PX)
-    confidence = view_map(depth.confidence, view, photo_size)
-    warped = forward_warp(photo_view, disparity)
+    with meter.stage("disparity"):
+        largest_px = scale * depth.inverse_depth.shape[-1] * view.scale_x
+        disparity = view_map(depth.inverse_depth, view, depth.first_row) * (largest_px / NEAREST)
+        disparity = dilate_disparity(disparity, config.dilate_px)
+        confidence = view_map(depth.confidence, view, depth.first_row) / CERTAIN
+    with meter.stage("sharpen"):
+        disparity = sharpen_disparity(disparity).clamp(min=SMALLEST_DISPARITY_PX)
+    with meter.stage("warp"):
+        warped = forward_warp(photo_view, disparity)
 
     width = view.width - view.margin
     missing = max(0, INPAINT_CONTEXT_PX - view.margin)  # the photo ends there: nothing is known of it

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 
@@ -32,6 +32,9 @@ class ViewConfig:
                 raise ValueError(f"{name} is in 0..1; got {getattr(self, name)}")
 
 
+REDUCTIONS = (8, 4, 2)  # by which a JPEG can be decoded at a fraction of its size, for a fraction of the time
+
+
 class View(NamedTuple):
     """A window of the photo (mirrored first, where `mirror` says so) and the size it is brought to.
 
@@ -44,11 +47,17 @@ class View(NamedTuple):
     height: int
     width: int  # of the result, margin included
     margin: int
+    reduction: int = 1  # the photo may be decoded at one part in so many: the window's sides and place are multiples of it
 
     @property
     def scale_x(self) -> float:
         """Pixels of the result per pixel of the photo, horizontally."""
         return self.width / self.window[3]
+
+    @property
+    def rows(self) -> tuple[int, int]:
+        """First and last row of the photo that are shown, the last one excluded."""
+        return self.window[0], self.window[0] + self.window[2]
 
 
 def draw_view(
@@ -70,46 +79,60 @@ def draw_view(
     scale = max(2**exponent, height / photo_height, width / photo_width)  # one scale for both sides: a small photo keeps its aspect
     window_width = min(photo_width, max(1, round(width / (scale * 2**stretch_x))))
     window_height = min(photo_height, max(1, round(height / (scale * 2**stretch_y))))
-    left = int(draws[4] * (photo_width - window_width + 1))
-    top = int(draws[5] * (photo_height - window_height + 1))
+    reduction = _reduction(photo_size, crop_size, (window_height, window_width))
+    window_width -= window_width % reduction
+    window_height -= window_height % reduction
+    left = int(draws[4] * ((photo_width - window_width) // reduction + 1)) * reduction
+    top = int(draws[5] * ((photo_height - window_height) // reduction + 1)) * reduction
 
-    beyond = min(photo_width - left - window_width, math.ceil(largest_share * photo_width) + 1)
+    beyond = min(photo_width - left - window_width, reduction * math.ceil((largest_share * photo_width + 1) / reduction))
     margin = round(beyond * width / window_width)
     window = (top, left, window_height, window_width + (beyond if margin else 0))
-    return View(bool(draws[6] < config.mirror_probability), window, height, width + margin, margin)
+    return View(bool(draws[6] < config.mirror_probability), window, height, width + margin, margin, reduction)
 
 
-def view_photo(photo: np.ndarray, view: View) -> np.ndarray:
-    """The view's part of an RGB photo: uint8 [H, W, 3] to uint8 [height, width, 3], averaged where it shrinks, bilinear where it grows."""
-    top, left, height, width = _window_in_photo(view, photo.shape[1])
+def whole_view(photo_size: tuple[int, int]) -> View:
+    """The whole photo as it is."""
+    height, width = photo_size
+    return View(mirror=False, window=(0, 0, height, width), height=height, width=width, margin=0)
+
+
+def _reduction(photo_size: tuple[int, int], crop_size: tuple[int, int], window_size: tuple[int, int]) -> int:
+    """The largest by which the photo's sides can be divided and still leave every pixel of the crop one of the window's."""
+    for reduction in REDUCTIONS:
+        divides = all(side % reduction == 0 for side in photo_size)
+        if divides and all(side // reduction >= crop for side, crop in zip(window_size, crop_size, strict=True)):
+            return reduction
+    return 1
+
+
+def view_photo(photo: np.ndarray, view: View, reduction: int = 1) -> np.ndarray:
+    """The view's part of an RGB photo: uint8 [H, W, 3] to uint8 [height, width, 3], averaged where it shrinks, bilinear where it grows.
+
+    Args:
+        photo: the whole one, decoded at one part in `reduction` (1 or the view's own).
+    """
+    top, left, height, width = (number // reduction for number in _window_in_photo(view, photo.shape[1] * reduction))
     part = photo[top : top + height, left : left + width]
     shrinks = view.height * view.width < height * width
-    part = cv2.resize(part, (view.width, view.height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    return np.ascontiguousarray(part[:, ::-1]) if view.mirror else part
+    if part.shape[:2] != (view.height, view.width):
+        part = cv2.resize(part, (view.width, view.height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    return cv2.flip(part, 1) if view.mirror else part
 
 
-def view_map(values: Tensor, view: View, photo_size: tuple[int, int]) -> Tensor:
-    """The view's part of a map over the whole photo, bilinear: float [B, C, h, w] of any resolution to [B, C, height, width]."""
-    top, left, height, width = _window_in_photo(view, photo_size[1])
-    rows, columns = values.shape[-2:]
-    values = _resample(values, -2, top * rows / photo_size[0], height * rows / photo_size[0], view.height)
-    values = _resample(values, -1, left * columns / photo_size[1], width * columns / photo_size[1], view.width)
-    return values.flip(-1) if view.mirror else values
+def view_map(values: Tensor, view: View, first_row: int = 0) -> Tensor:
+    """The view's part of maps of the photo's resolution, bilinear: [B, C, h, w] of any dtype to float32 [B, C, height, width].
+
+    Args:
+        values: all columns of the photo, and its rows from `first_row` on, as far as the view shows them.
+    """
+    top, left, height, width = _window_in_photo(view, values.shape[-1])
+    part = values[..., top - first_row : top - first_row + height, left : left + width].float()
+    if part.shape[-2:] != (view.height, view.width):
+        part = F.interpolate(part, (view.height, view.width), mode="bilinear", align_corners=False)
+    return part.flip(-1) if view.mirror else part
 
 
 def _window_in_photo(view: View, photo_width: int) -> tuple[int, int, int, int]:
     top, left, height, width = view.window
     return (top, photo_width - left - width if view.mirror else left, height, width)
-
-
-def _resample(values: Tensor, axis: int, start: float, extent: float, count: int) -> Tensor:
-    """Linear interpolation at the centres of `count` equal parts of start..start + extent along one axis (pixel i covers i..i + 1)."""
-    position = torch.arange(count, dtype=torch.float64) + 0.5
-    position = (position * (extent / count) + (start - 0.5)).clamp_(0, values.shape[axis] - 1)
-    first = position.floor().long()
-    second = (first + 1).clamp_(max=values.shape[axis] - 1)
-    share = (position - first).to(values.dtype).to(values.device)
-    shape = (-1, 1) if axis == -2 else (-1,)
-    first_values = values.index_select(axis, first.to(values.device))
-    second_values = values.index_select(axis, second.to(values.device))
-    return torch.lerp(first_values, second_values, share.view(shape))

@@ -202,8 +202,9 @@ def _spans(plane: Tensor, nearest: Tensor, grid: _Grid) -> _Spans:
 def _colours(left: Tensor, spans: _Spans, torn: Tensor) -> Iterator[Tensor]:
     """`left` [B, C, rows, W] at the spans' points; [N] for each channel, anything in holes.
 
-    Cubic convolution, with t the share: lerp(p(i), p(i + 1), t) - t (1 - t) / 2 lerp(p''(i), p''(i + 1), t), p'' being the second difference
-    p(i - 1) - 2 p(i) + p(i + 1). Where a surface ends it is zero: the colour goes on straight there, and nothing of the other side comes in.
+    Cubic convolution, with t the share and p'' the second difference p(i - 1) - 2 p(i) + p(i + 1):
+    lerp(p(i), p(i + 1), t) - t (1 - t) / 2 lerp(p''(i), p''(i + 1), t). Where a surface ends p'' is zero: there its
+    colour goes on straight, and nothing of the other side comes in.
     """
     inside = left.new_ones(spans.first.numel() + 2 * PAD - 2)
     inside[:PAD] = 0

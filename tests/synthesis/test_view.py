@@ -1,0 +1,80 @@
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.scenes import jpeg, photo
+from zsdata.source.photo import decode_rgb
+from zsdata.synthesis.view import View, ViewConfig, draw_view, view_map, view_photo, whole_view
+
+SMALL_SCALES = ViewConfig(min_scale=-3.5, max_scale=0)
+
+
+def views(config):
+    size = st.tuples(st.integers(32, 900), st.integers(32, 900))
+    return st.builds(
+        lambda photo_size, crop, seed, share: (photo_size, crop, draw_view(photo_size, crop, np.random.default_rng(seed), config, share)),
+        size | st.sampled_from([(512, 768), (768, 1024), (480, 640)]),
+        st.tuples(st.integers(32, 96), st.integers(32, 128)),
+        st.integers(0, 2**32),
+        st.floats(0.01, 0.2),
+    )
+
+
+@given(views(ViewConfig()) | views(SMALL_SCALES))
+def test_a_view_lies_in_the_photo_and_gives_the_crop_and_what_lands_in_it(case):
+    (photo_height, photo_width), (height, width), view = case
+    top, left, rows, columns = view.window
+    assert top >= 0 and left >= 0 and rows >= 1 and columns >= 1 and top + rows <= photo_height and left + columns <= photo_width
+    assert (view.height, view.width - view.margin) == (height, width)
+    assert view.rows == (top, top + rows)
+    assert all(number % view.reduction == 0 for number in (*view.window, photo_height, photo_width))
+
+
+@given(views(SMALL_SCALES))
+def test_a_reduced_photo_still_has_a_pixel_for_every_pixel_of_the_view(case):
+    _, _, view = case
+    if view.reduction > 1:
+        assert view.window[2] // view.reduction >= view.height
+        assert view.window[3] // view.reduction >= view.width - 1  # the margin is rounded to whole columns
+
+
+def test_small_scales_are_reduced_and_the_usual_ones_are_not():
+    reductions = {draw_view((1536, 2048), (384, 512), np.random.default_rng(i), SMALL_SCALES, 0.1).reduction for i in range(200)}
+    assert reductions == {1, 2, 4}
+    usual = {draw_view((1536, 2048), (384, 512), np.random.default_rng(i), ViewConfig(), 0.1).reduction for i in range(200)}
+    assert usual == {1}
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+@pytest.mark.parametrize("reduction", [2, 4])
+def test_a_view_of_a_jpeg_decoded_at_a_fraction_is_the_view_of_the_whole_one(orientation, reduction):
+    smooth = cv2.GaussianBlur(photo(0, 256, 384), (0, 0), 3)
+    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01" + bytes([0, orientation, 0, 0, 0, 0, 0, 0])
+    data = jpeg(smooth)
+    data = data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:]
+    whole = decode_rgb(data)
+    view = View(True, (64, 32, 128, 160), 128 // reduction, 160 // reduction, 0, reduction)
+    small = decode_rgb(data, reduction)
+    assert small.shape[:2] == (whole.shape[0] // reduction, whole.shape[1] // reduction)
+    difference = np.abs(view_photo(small, view, reduction).astype(int) - view_photo(whole, view))
+    assert difference.mean() < 1 and difference.max() < 12
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_photo_and_map_show_the_same_place(mirror):
+    ramp = np.add.outer(np.arange(100.0), 0.5 * np.arange(150.0)).astype(np.float32)
+    view = View(mirror, (10, 20, 60, 80), 45, 100, 0)
+    shown = view_map(torch.from_numpy(ramp)[None, None], view)[0, 0].numpy()
+    expected = cv2.resize(ramp[10:70, 50:130] if mirror else ramp[10:70, 20:100], (100, 45), interpolation=cv2.INTER_LINEAR)
+    assert np.allclose(shown, expected[:, ::-1] if mirror else expected, atol=1e-3)
+    rows = ramp[8:75]
+    assert np.array_equal(view_map(torch.from_numpy(rows)[None, None], view, first_row=8)[0, 0].numpy(), shown)
+
+
+def test_a_whole_view_changes_nothing():
+    image = photo(1, 40, 60)
+    view = whole_view((40, 60))
+    assert np.array_equal(view_photo(image, view), image) and view.scale_x == 1 and view.margin == 0
