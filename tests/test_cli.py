@@ -266,6 +266,15 @@ def test_export_writes_a_pair_per_photo_and_goes_on_where_it_stopped(run, tmp_pa
 
 
 @pytest.mark.usefixtures("cheap")
+def test_export_makes_pairs_of_whole_photos_unless_told_a_size(run, tmp_path):
+    shard = photo_tar(tmp_path / "a.tar", count=1, height=70, width=90)
+    assert run("export", "--sources", shard, "--output", tmp_path / "out")[0] == 0
+    assert load_exported(read_exported(tmp_path / "out")[0]).left.shape == (70, 90, 3)
+    status, _, error = run("export", "--sources", shard, "--output", tmp_path / "out", "--size", 64, 64)
+    assert status == 2 and "size was null and is [64, 64]" in in_words(error)
+
+
+@pytest.mark.usefixtures("cheap")
 def test_export_says_which_photos_were_replaced(run, tmp_path):
     shard = write_tar(tmp_path / "a.tar", {"bad.jpg": b"<html>", "good.jpg": jpeg(photo(0))})
     status, out, _ = run("export", "--sources", shard, "--output", tmp_path / "out", "--size", 64, 64)

@@ -1,6 +1,7 @@
 """Export: the published layout, and that no stop at any moment shows in the outcome."""
 
 import fcntl
+import io
 import json
 import multiprocessing
 import os
@@ -158,6 +159,21 @@ def test_pairs_go_on_into_the_next_epoch_and_the_last_argument_is_one_pass(strea
         place_name(epoch, index)[:14] for epoch, index in ((1, 0), (1, 1), (1, 2), (2, 0), (2, 1), (2, 2), (3, 0))
     ]
     assert stream.state_dict()["samples"] == 0
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_whole_photos_keep_their_own_sizes(tmp_path, workers):
+    photos = {f"{height}x{width}": jpeg(photo(height, height, width)) for height, width in ((64, 96), (97, 63), (120, 160))}
+    shard = write_tar(tmp_path / "a.tar", {f"{name}.jpg": data for name, data in photos.items()})
+    export_pairs(stream_of(shard, size=None), tmp_path / "out", workers=workers)
+    entries = read_exported(tmp_path / "out")
+    assert len(entries) == 3
+    for entry in entries:
+        with Image.open(io.BytesIO(photos[json.loads(exported.meta_file(entry).read_text())["key"]])) as opened:
+            original = np.array(opened)
+        loaded = load_exported(entry)
+        assert all(array.shape[:2] == original.shape[:2] for array in loaded)
+        assert np.abs(loaded.left.astype(float) - original).mean() < 1
 
 
 def test_workers_change_no_byte(shard, tmp_path):
