@@ -67,9 +67,10 @@ def nearest_sharp(disparity: np.ndarray, edge: np.ndarray) -> np.ndarray:
     return result
 
 
-def catmull_rom(p: list[float], t: float) -> float:
-    """Cubic convolution with a = -1/2 at t between p[1] and p[2]."""
-    return p[1] + 0.5 * t * (p[2] - p[0] + t * (2 * p[0] - 5 * p[1] + 4 * p[2] - p[3] + t * (3 * (p[1] - p[2]) + p[3] - p[0])))
+def cubic(p: list[float], t: float) -> float:
+    """At t between p[1] and p[2]: the straight line between them, less t (1 - t) times that between the second differences; by powers of t."""
+    first, second = p[0] - 2 * p[1] + p[2], p[1] - 2 * p[2] + p[3]
+    return p[1] + (p[2] - p[1] - first) * t + (2 * first - second) * t**2 + (second - first) * t**3
 
 
 def is_permutation(values: list[int]) -> bool:

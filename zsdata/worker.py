@@ -162,7 +162,7 @@ class Worker:
             depth = self._depth_of(photo, view.rows)
         made = synthesize(_image(left), depth, view, scale, recipe.synthesis, meter)
 
-        size = made.left.shape[-2:]
+        size = view.height, view.width - view.margin
         context = {}
         if "right_disparity" in recipe.inpainter_needs:
             context["right_disparity"] = made.right_disparity[0].contiguous()

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from tests.oracles import catmull_rom, warp_row
+from tests.oracles import cubic, warp_row
 from zsdata.synthesis.warp import forward_warp
 
 
@@ -38,7 +38,7 @@ def test_a_subpixel_shift_interpolates_between_the_two_pixels():
     warp = warp_one_row([3.25] * 32, left)
     row = left.flatten().tolist()
     for u in range(1, 27):
-        expected = catmull_rom(row[u + 2 : u + 6], 0.25)
+        expected = cubic(row[u + 2 : u + 6], 0.25)
         assert warp.right[0, 0, 0, u].item() == pytest.approx(min(max(expected, min(row)), max(row)), abs=1e-3)
 
 
