@@ -68,7 +68,7 @@ def nearest_sharp(disparity: np.ndarray, edge: np.ndarray) -> np.ndarray:
 
 
 def cubic(p: list[float], t: float) -> float:
-    """At t between p[1] and p[2]: the straight line between them, less t (1 - t) times that between the second differences; by powers of t."""
+    """At t between p[1] and p[2]: the line between them, less t (1 - t) times that between the second differences; by powers of t."""
     first, second = p[0] - 2 * p[1] + p[2], p[1] - 2 * p[2] + p[3]
     return p[1] + (p[2] - p[1] - first) * t + (2 * first - second) * t**2 + (second - first) * t**3
 

@@ -24,7 +24,7 @@ from torch import Tensor
 from zsdata.synthesis.indices import flat_indices
 
 CACHED_PX = 65_536  # warped at once on the CPU: what is between the steps stays in its cache
-# Of the cubic that resamples colours. At 1/2 it is Catmull-Rom's; at 1 a shift by half a pixel leaves the right view as sharp as the left one
+# Of the cubic that resamples colours. At 1/2 it is Catmull-Rom's; at 1 a shift by half a pixel leaves the right view as sharp as the left
 # (0.92 of its gradient energy against 0.72), so that blur does not tell the fraction of a disparity. See benchmarks/reprojection.py.
 SHARPNESS = 1.0
 LARGEST_STEP_PX = 1.0  # neighbours whose disparities differ by more are two surfaces
@@ -216,11 +216,14 @@ def _colours(left: Tensor, spans: _Spans, torn: Tensor) -> Iterator[Tensor]:
     inside[torn + PAD] = 0
     share = spans.share.to(left.dtype)
     bend = SHARPNESS * share * (share - 1)
+
+    def between(plane: Tensor) -> Tensor:
+        return torch.lerp(plane.index_select(0, spans.first), plane[1:].index_select(0, spans.first), share)
+
     for channel in range(left.shape[1]):
         plane = _padded(left[:, channel])
         second = (plane[:-2] + plane[2:]).sub_(plane[1:-1], alpha=2).mul_(inside)
-        colour = torch.lerp(*(plane[tap:].index_select(0, spans.first) for tap in (1, 2)), share)
-        yield colour.addcmul_(bend, torch.lerp(*(second[tap:].index_select(0, spans.first) for tap in (0, 1)), share))
+        yield between(plane[1:]).addcmul_(bend, between(second))
 
 
 def _wins_where_it_lands(plane: Tensor, spans: _Spans, grid: _Grid) -> Tensor:
