@@ -22,9 +22,10 @@ from zsdata.position import Position
 from zsdata.seeding import rng
 from zsdata.source.manifest import Manifest
 from zsdata.source.photo import decode_rgb
+from zsdata.synthesis.confidence import normalize_inverse_depth
 from zsdata.synthesis.depth import DepthEstimator, load_depth
+from zsdata.synthesis.depth.builtin import warn_once
 from zsdata.synthesis.disparity import AdaptiveDisparity
-from zsdata.synthesis.synthesizer import SynthesisConfig, estimate_depth
 from zsdata.worker import MOST_SPARES, SHORTEST_SIDE_PX, single_thread
 
 
@@ -77,6 +78,8 @@ class PhotoSource:
     def __init__(self, manifest: Manifest, depth: str | DepthEstimator, scale: AdaptiveDisparity) -> None:
         self._manifest, self._name, self._scale = manifest, depth, scale
         self._depth: DepthEstimator | None = None
+        if depth == "builtin":
+            warn_once()  # here, and not in every worker
 
     @property
     def digest(self) -> str:
@@ -99,8 +102,7 @@ class PhotoSource:
             self._depth = load_depth(self._name)
         image = torch.from_numpy(photo).permute(2, 0, 1)[None].to(torch.float32, memory_format=torch.contiguous_format)
         with torch.inference_mode():
-            depth = estimate_depth(self._depth, image, SynthesisConfig(flip_confidence=False))
-            return from_photo(photo, depth.inverse_depth, self._scale, size, draw)
+            return from_photo(photo, normalize_inverse_depth(self._depth(image)), self._scale, size, draw)
 
 
 @dataclass(frozen=True)
@@ -149,7 +151,7 @@ class Examples(Dataset):
 
     def __init__(self, sources: Mapping[str, Source], size: tuple[int, int], seed: int, batch_size: int) -> None:
         sizes = tuple(len(source) for source in sources.values())
-        self._sources, self._size, self._seed, self._batch_size = dict(sources), size, seed, batch_size
+        self._sources, self.size, self._seed, self._batch_size = dict(sources), size, seed, batch_size
         self._plan = EpochPlan(seed, tuple(sources), sizes, sizes)
 
     def __len__(self) -> int:
@@ -168,7 +170,7 @@ class Examples(Dataset):
                 name, source = list(self._sources.items())[choice.source]
                 where = source.place(choice.member)
                 try:
-                    right, warped, inpaint_mask = source.make(choice.member, self._size, draw)
+                    right, warped, inpaint_mask = source.make(choice.member, self.size, draw)
                     return ExampleBatch(
                         _to_uint8(right), _to_uint8(warped), inpaint_mask, [request], [f"{where[1]} in {where[0]}"], rejected
                     )
@@ -191,7 +193,7 @@ class Examples(Dataset):
             epoch=epoch,
             samples=place,
             manifest=hashlib.sha256(json.dumps(digests).encode()).hexdigest(),
-            configuration=hashlib.sha256(json.dumps([self._size, self._batch_size]).encode()).hexdigest(),
+            configuration=hashlib.sha256(json.dumps([self.size, self._batch_size]).encode()).hexdigest(),
         )
 
 

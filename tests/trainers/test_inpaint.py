@@ -1,0 +1,436 @@
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from accelerate.state import AcceleratorState
+from safetensors.torch import load_file
+from skimage.metrics import structural_similarity
+
+from tests.scenes import SHARED, layered_depth, photo, photo_tar, write_tar
+from tests.small_pipeline import save_small_pipeline
+from tests.trainers.test_inpaint_data import pfm, png
+from tests.trainers.test_training import launch
+from trainers import inpaint, run_folder
+from trainers.arguments import run as run_trainer
+from trainers.hole_scores import hole_cases, score_holes
+from trainers.inpaint_data.layouts import StereoFolder
+from trainers.inpaint_data.sources import ExampleBatch, Examples, PhotoSource, StereoSource
+from trainers.inpaint_loop import TuneConfig, tune
+from trainers.noise_prediction import NoisePrediction
+from trainers.pairs_on_disk import StereoPair
+from trainers.pipeline_folder import local_pipeline
+from trainers.weight_average import WeightAverage
+from zsdata import AdaptiveDisparity, ZeroStereoStream, load_inpainter
+from zsdata.source.manifest import build_manifest
+from zsdata.synthesis.inpaint.diffusion_parts import load_diffusion_parts
+
+pytest.importorskip("diffusers")
+pytest.importorskip("transformers")
+
+ROOT = Path(__file__).resolve().parents[2]
+PUBLISHED = SHARED / "published" / "tiny_inpainting"
+SIZE = (64, 64)
+FROZEN = ("vae/diffusion_pytorch_model.safetensors", "text_encoder/model.safetensors", "scheduler/scheduler_config.json", "README.md")
+
+
+@pytest.fixture(autouse=True)
+def fresh_accelerator():
+    yield
+    AcceleratorState._reset_state(reset_partial_state=True)
+
+
+@pytest.fixture(scope="module")
+def pipeline(tmp_path_factory):
+    return save_small_pipeline(tmp_path_factory.mktemp("pipeline"))
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    return photo_tar(tmp_path_factory.mktemp("photos") / "photos.tar", 6, height=72, width=96)
+
+
+@pytest.fixture(scope="module")
+def things(tmp_path_factory):
+    """FlyingThings3D as published, with photos in place of renderings."""
+    root = tmp_path_factory.mktemp("things")
+    for number in range(4):
+        left, right, truth = stereo_images(number)
+        frame = "TRAIN/A/0000/{}/" + f"{number:04d}"
+        for name, data in {
+            f"frames_cleanpass/{frame.format('left')}.png": png(left),
+            f"frames_cleanpass/{frame.format('right')}.png": png(right),
+            f"disparity/{frame.format('left')}.pfm": pfm(truth),
+        }.items():
+            (root / name).parent.mkdir(parents=True, exist_ok=True)
+            (root / name).write_bytes(data)
+    return root
+
+
+def stereo_images(number, height=72, width=96):
+    """A wall of disparity 4 and a thing of disparity 14 before it."""
+    wall = photo(number, height, width + 4)
+    left, right, truth = wall[:, :width].copy(), wall[:, 4:].copy(), np.full((height, width), 4, np.float32)
+    thing = photo(100 + number, 30, 24)
+    left[20:50, 40:64], right[20:50, 26:50], truth[20:50, 40:64] = thing, thing, 14
+    return left, right, truth
+
+
+def real_pair(number=0):
+    left, right, truth = stereo_images(number)
+    return StereoPair(f"pair {number}", left, right, truth, np.ones(truth.shape, bool), None)
+
+
+def examples_of(*, photos=None, things=None, batch_size=4, seed=0, size=SIZE):
+    sources = {}
+    if things is not None:
+        sources["things"] = StereoSource(StereoFolder("sceneflow-clean", things))
+    if photos is not None:
+        sources["photos"] = PhotoSource(build_manifest(photos), layered_depth, AdaptiveDisparity())
+    return Examples(sources, size, seed, batch_size)
+
+
+def config(**changes):
+    usual = {"steps": 4, "batch_size": 4, "micro_batch": 4, "save_every": 2, "workers": 0, "mixed_precision": "no", "validation_steps": 2}
+    return TuneConfig(**(usual | changes))
+
+
+def run(pipeline, examples, output, settings, **options):
+    AcceleratorState._reset_state(reset_partial_state=True)
+    return tune(pipeline, examples, settings, output=output, arguments={}, **({"tracker": None} | options))
+
+
+def weights(folder):
+    return load_file(folder / "unet" / "diffusion_pytorch_model.safetensors")
+
+
+def loss_of(folder, examples, first_step=1000):
+    """On examples, noise and timesteps that no training here has seen."""
+    parts = load_diffusion_parts(str(folder))
+    batch = ExampleBatch.stack([examples[first_step, index] for index in range(32)])
+    with torch.no_grad():
+        return NoisePrediction(parts, torch.device("cpu"), seed=0).loss(parts.unet, batch).item()
+
+
+@pytest.mark.parametrize("source", ["photos", "things"])
+def test_the_loss_falls_and_the_saved_folder_works_in_the_stream(pipeline, photos, things, tmp_path, source):
+    examples = examples_of(**{source: {"photos": photos, "things": things}[source]}, batch_size=8)
+    settings = config(steps=30, batch_size=8, micro_batch=8, learning_rate=1e-2, save_every=30)
+    saved = run(pipeline, examples, tmp_path / "run", settings)
+    before, after = loss_of(pipeline, examples), loss_of(saved, examples)
+    assert after < 0.8 * before, (before, after)
+    for name in FROZEN:
+        assert (saved / name).read_bytes() == (pipeline / name).read_bytes()
+    stream = ZeroStereoStream(photos, size=SIZE, depth=layered_depth, inpaint=load_inpainter(saved, steps=2))
+    pair, untuned = (
+        next(iter(stream)),
+        next(iter(ZeroStereoStream(photos, size=SIZE, depth=layered_depth, inpaint=load_inpainter(pipeline, steps=2)))),
+    )
+    hole = pair.masks.inpaint.expand(3, -1, -1)
+    assert hole.any() and (pair.right_clean - untuned.right_clean)[hole].abs().mean() > 1
+    assert torch.equal(pair.right_clean[~hole], untuned.right_clean[~hole])
+
+
+def test_the_protocol_is_the_papers():
+    paper = TuneConfig()
+    assert (paper.steps, paper.batch_size, paper.learning_rate) == (50_000, 32, 2e-5)
+
+
+def test_the_unet_is_asked_as_the_inpainter_asks_it(pipeline, photos):
+    """At every place where the stream's inpainter and the trainer meet: order of channels, scaling, prompt, and cells that hold a hole."""
+    seen = {}
+
+    def unet(asked, timesteps, encoder_hidden_states):
+        seen.update(asked=asked, prompt=encoder_hidden_states, timesteps=timesteps)
+        return type("Out", (), {"sample": torch.zeros(len(asked), 4, *asked.shape[2:])})
+
+    examples = examples_of(photos=photos)
+    batch = ExampleBatch.stack([examples[0, index] for index in range(4)])
+    parts = load_diffusion_parts(str(pipeline))
+    prediction = NoisePrediction(parts, torch.device("cpu"), seed=0)
+    loss = prediction.loss(unet, batch)
+    noise, timesteps = prediction._draw(batch)
+    assert torch.isclose(loss, noise.square().mean())  # L2 against the noise itself
+    assert torch.equal(seen["timesteps"], timesteps) and seen["prompt"].shape == (4, 2, 16)
+
+    inpainter = load_inpainter(pipeline, steps=2)
+    masked = (batch.warped.float() / 127.5 - 1).masked_fill(batch.inpaint_mask, 0)
+    with torch.no_grad():
+        assert torch.allclose(seen["asked"][:, 5:], inpainter._encode(masked), atol=1e-5)
+        latents = inpainter._encode(batch.right.float() / 127.5 - 1)
+    cells = seen["asked"][:, 4:5].repeat_interleave(8, 2).repeat_interleave(8, 3)
+    assert cells[batch.inpaint_mask].min() == 1 and 0 < cells.mean() < 1
+    kept = (
+        torch.cumprod(1 - torch.linspace(0.00085**0.5, 0.012**0.5, 1000, dtype=torch.float64) ** 2, 0)[timesteps].view(-1, 1, 1, 1).float()
+    )
+    assert torch.allclose(seen["asked"][:, :4], kept.sqrt() * latents + (1 - kept).sqrt() * noise, atol=1e-4)
+
+
+def test_noise_and_timesteps_belong_to_the_example(pipeline, photos):
+    examples = examples_of(photos=photos)
+    prediction = NoisePrediction(load_diffusion_parts(str(pipeline)), torch.device("cpu"), seed=0)
+    noise, timesteps = prediction._draw(ExampleBatch.stack([examples[s, i] for s in range(10) for i in range(4)]))
+    alone = prediction._draw(examples[2, 3])
+    assert torch.equal(alone[0][0], noise[11]) and alone[1][0] == timesteps[11]
+    assert len({row.sum().item() for row in noise}) == 40 and len(set(timesteps.tolist())) > 30
+    assert 0 <= timesteps.min() < 200 and 800 < timesteps.max() < 1000 and abs(noise.std() - 1) < 0.05
+
+
+@pytest.mark.parametrize(("workers", "micro_batch", "ema"), [(0, 4, None), (2, 2, 0.9)])
+def test_a_resumed_run_equals_the_unbroken_one(pipeline, photos, things, tmp_path, monkeypatch, workers, micro_batch, ema):
+    examples = examples_of(photos=photos, things=things)
+    settings = config(steps=5, workers=workers, micro_batch=micro_batch, ema=ema, learning_rate=1e-3)
+    unbroken = run(pipeline, examples, tmp_path / "unbroken", settings)
+    asked = NoisePrediction.loss
+
+    def fails_in_step_three(self, model, batch):
+        if batch.requests[-1] == (3, 3):
+            raise RuntimeError("power cut")
+        return asked(self, model, batch)
+
+    with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="power cut"):
+        patch.setattr(NoisePrediction, "loss", fails_in_step_three)
+        run(pipeline, examples, tmp_path / "broken", settings)
+    assert run_folder.newest(tmp_path / "broken").name == "step-00000002"
+    resumed = run(pipeline, examples_of(photos=photos, things=things), tmp_path / "broken", settings, resume=tmp_path / "broken")
+    assert resumed.parent.name == "step-00000005"
+    before, expected, found = weights(pipeline), weights(unbroken), weights(resumed)
+    assert any(not torch.equal(before[name], expected[name]) for name in expected)
+    for name, weight in expected.items():
+        assert torch.equal(found[name], weight), name
+
+
+def test_a_smaller_micro_batch_and_gradient_checkpointing_change_nothing_but_rounding(pipeline, photos, tmp_path):
+    examples = examples_of(photos=photos)
+    whole = weights(run(pipeline, examples, tmp_path / "whole", config(steps=2, learning_rate=1e-3)))
+    changed = config(steps=2, learning_rate=1e-3, micro_batch=1, gradient_checkpointing=True)
+    split = weights(run(pipeline, examples, tmp_path / "split", changed))
+    for name, weight in whole.items():
+        assert torch.allclose(split[name], weight, atol=2e-4), name  # a fifth of what Adam moves a weight by in one step
+
+
+def test_a_run_of_another_seed_data_or_length_is_not_resumed(pipeline, photos, things, tmp_path):
+    run(pipeline, examples_of(photos=photos), tmp_path, config(steps=4))
+    shutil.rmtree(tmp_path / "checkpoints" / "step-00000004")
+    cases = [
+        ("state's seed", examples_of(photos=photos, seed=1), config(seed=1)),
+        ("state's manifest", examples_of(photos=photos, things=things), config()),
+        ("state's configuration", examples_of(photos=photos, batch_size=2), config(batch_size=2, micro_batch=2)),
+        ("planned for 4 steps", examples_of(photos=photos), config(steps=6)),
+        ("has all of the 2 steps", examples_of(photos=photos), config(steps=2)),
+    ]
+    for message, examples, settings in cases:
+        with pytest.raises(ValueError, match=message):
+            run(pipeline, examples, tmp_path, settings, resume=tmp_path)
+
+
+def test_the_average_is_saved_and_the_training_goes_on_with_the_weights_themselves(pipeline, photos, tmp_path):
+    saved = run(pipeline, examples_of(photos=photos), tmp_path / "run", config(steps=2, ema=0.5, learning_rate=1e-3))
+    training, _ = run_folder.load(saved.parent)
+    mean, own, first = weights(saved), training["weights"], weights(pipeline)
+    name = "conv_in.weight"
+    assert not torch.equal(mean[name], own[name]) and not torch.equal(mean[name], first[name])
+    network = torch.nn.Linear(1, 1)
+    average = WeightAverage(network, 0.9)
+    begin = network.weight.detach().clone()
+    with torch.no_grad():
+        network.weight += 1
+    average.update(network, step=1)
+    assert torch.allclose(average.weights[0], begin + 1 - 2 / 11)  # warming up
+    average.update(network, step=10_000)
+    assert torch.allclose(average.weights[0], begin + 1 - 0.9 * 2 / 11)
+
+
+def test_real_pairs_are_judged_before_and_at_every_checkpoint(pipeline, photos, tmp_path, capsys):
+    pairs = [real_pair(0), real_pair(1)]
+    sparse = real_pair(2)._replace(name="sparse", valid=np.arange(96) % 2 == np.zeros((72, 1)))
+    run(pipeline, examples_of(photos=photos), tmp_path, config(steps=4), pairs=[*pairs, sparse])
+    rows = [json.loads(line) for line in (tmp_path / "validation.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == [0, 2, 4]
+    for row in rows:
+        assert [score["name"] for score in row["pairs"]] == ["pair 0", "pair 1"]
+        assert row["mean"]["psnr"] == pytest.approx(np.mean([score["psnr"] for score in row["pairs"]]))
+    assert rows[0]["mean"]["psnr"] != rows[1]["mean"]["psnr"]
+    printed = capsys.readouterr().out
+    assert "not judged, for want of dense ground truth or of holes: sparse" in printed and "step 4: holes of 2 pairs, PSNR" in printed
+    logged = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert logged[-1]["step"] == 4 and {"loss", "learning_rate", "examples_per_second", "wait_share"} < logged[-1].keys()
+
+
+def test_hole_scores_are_psnr_and_ssim_over_the_holes():
+    pair = real_pair()
+    (case,), left_out = hole_cases([pair], (72, 96))
+    assert not left_out and torch.equal(case.truth[0].permute(1, 2, 0), torch.from_numpy(pair.right).float())
+    hole = case.inpaint_mask[0, 0].numpy()
+    assert np.array_equal(hole[30], [*[False] * 51, *[True] * 10, *[False] * 31, *[True] * 4]) and np.array_equal(
+        case.scored[0, 0].numpy(), hole
+    )
+
+    def ten_too_bright(right, inpaint_mask, generators):
+        return torch.where(inpaint_mask, case.truth + 10, right)
+
+    score = score_holes(ten_too_bright, case._replace(truth=case.truth.clamp(0, 245)), 0)
+    assert score["pixels"] == hole.sum() and score["name"] == "pair 0"
+    made = np.where(hole[..., None], pair.right.astype(float).clip(0, 255) + 10, pair.right.clip(0, 245)).clip(0, 255)
+    truth = pair.right.clip(0, 245).astype(float)
+    assert score["psnr"] == pytest.approx(10 * np.log10(255**2 / ((made - truth)[hole] ** 2).mean()), abs=1e-3)
+    similarity = structural_similarity(truth, made, channel_axis=-1, data_range=255, full=True, win_size=7, use_sample_covariance=False)[1]
+    inner = hole.copy()
+    assert score["ssim"] == pytest.approx(np.asarray(similarity)[inner].mean(), abs=0.02)  # the frame's edge is padded otherwise
+
+
+@pytest.mark.parametrize("unknown", [slice(64, 65), slice(65, 70)])  # what lands at the left end of the hole, at its right end
+def test_holes_beside_unknown_disparities_are_not_scored(unknown):
+    pair = real_pair()
+    valid = pair.valid.copy()
+    valid[25, unknown] = False
+    disparity = np.where(valid, pair.disparity, 0)
+    (case,), _ = hole_cases([pair._replace(valid=valid, disparity=disparity)], (72, 96))
+    scored = case.scored[0, 0].numpy()
+    assert case.inpaint_mask[0, 0, 25, 51:61].all() and not scored[25, 51:61].any()
+    assert scored[26, 51:61].all() and scored[25, 92:].all()
+
+
+def test_large_pairs_are_cut_in_the_middle_after_the_warp():
+    (whole,), _ = hole_cases([real_pair()], (200, 200))
+    (part,), _ = hole_cases([real_pair()], (40, 50))
+    for name in ("truth", "warped", "inpaint_mask", "scored"):
+        assert torch.equal(getattr(part, name), getattr(whole, name)[..., 16:56, 23:73])
+
+
+@pytest.mark.skipif(not PUBLISHED.is_dir(), reason="the published pipeline is not here")
+@pytest.mark.skipif(int(__import__("transformers").__version__.split(".")[0]) < 5, reason="its text encoder was saved by transformers 5")
+def test_a_pipeline_in_the_layout_of_the_papers_model_is_tuned(photos, tmp_path):
+    saved = run(PUBLISHED, examples_of(photos=photos), tmp_path, config(steps=1, batch_size=1, micro_batch=1))
+    assert json.loads((saved / "model_index.json").read_text())["_class_name"] == "StereoGen"
+    assert load_inpainter(saved, steps=1).steps == 1
+
+
+def test_a_pipeline_that_predicts_no_noise_is_refused(photos, tmp_path):
+    velocity = save_small_pipeline(tmp_path / "velocity", prediction_type="v_prediction")
+    with pytest.raises(ValueError, match="predicts v_prediction; this trainer teaches those that predict noise"):
+        run(velocity, examples_of(photos=photos), tmp_path / "run", config())
+
+
+def test_a_loss_that_is_not_finite_names_the_examples(pipeline, photos, tmp_path, monkeypatch):
+    monkeypatch.setattr(NoisePrediction, "loss", lambda self, model, batch: torch.tensor(float("nan"), requires_grad=True))
+    with pytest.raises(RuntimeError, match=r"the loss is nan at step 0; examples: 00000\d in .*photos.tar"):
+        run(pipeline, examples_of(photos=photos), tmp_path, config())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"steps": 0}, "steps is 1 or more; got 0"),
+        ({"learning_rate": 0.0}, "learning_rate is above 0"),
+        ({"workers": -1}, "workers is 0 or more"),
+        ({"ema": 1.0}, r"decay in \(0, 1\)"),
+    ],
+)
+def test_bad_options_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        config(**change)
+
+
+def test_the_batch_must_split_into_micro_batches(pipeline, photos, tmp_path):
+    assert config(batch_size=32, micro_batch=4).accumulate(2) == 4
+    with pytest.raises(ValueError, match="batch_size 4 is no multiple of micro_batch 3 times 1 ranks"):
+        run(pipeline, examples_of(photos=photos), tmp_path, config(micro_batch=3))
+    with pytest.raises(ValueError, match=r"multiples of 8 px .* got \(60, 64\)"):
+        run(pipeline, examples_of(photos=photos, size=(60, 64)), tmp_path, config())
+
+
+def test_a_pipeline_is_found_in_the_hubs_cache_without_network(pipeline, tmp_path):
+    repository = tmp_path / "hub" / "models--somebody--pipelines"
+    shutil.copytree(pipeline, repository / "snapshots" / ("0" * 40) / "StereoGen")
+    (repository / "refs").mkdir()
+    (repository / "refs" / "main").write_text("0" * 40)
+    program = (
+        "from trainers.pipeline_folder import local_pipeline\n"
+        'folder = local_pipeline("somebody/pipelines", "StereoGen")\n'
+        'assert (folder / "unet" / "config.json").is_file(), folder\n'
+    )
+    offline = {**os.environ, "HF_HOME": str(tmp_path), "HF_HUB_CACHE": str(tmp_path / "hub"), "HF_HUB_OFFLINE": "1"}
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, env=offline, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    with pytest.raises(FileNotFoundError, match="neither a folder nor a Hub id"):
+        local_pipeline("no/such/folder")
+
+
+def arguments_for(pipeline, output, *more):
+    usual = ["--size", 64, 64, "--batch-size", 2, "--micro-batch", 1, "--workers", 1, "--validation-steps", 1]
+    return ["--pipeline", pipeline, "--output", output, *usual, *more]
+
+
+@pytest.mark.filterwarnings("ignore:The built-in depth")
+def test_the_command_tunes_on_two_ranks_as_on_one(pipeline, photos, things, tmp_path, monkeypatch):
+    members = {}
+    for number in range(2):
+        left, right, truth = stereo_images(number)
+        members |= {f"{number}.left.png": png(left), f"{number}.right.png": png(right), f"{number}.disp.pfm": pfm(truth)}
+    tars = write_tar(tmp_path / "pairs.tar", members)
+    pair = tmp_path / "pairs" / "wall"
+    pair.mkdir(parents=True)
+    left, right, truth = stereo_images(9)
+    for name, data in {"left.png": png(left), "right.png": png(right), "disp.pfm": pfm(truth)}.items():
+        (pair / name).write_bytes(data)
+    data = ["--photos", photos, "--datasets", f"sceneflow-clean={things}", f"tars={tars}", "--validate", pair.parent, "--steps", 2]
+    data += ["--learning-rate", 1e-3, "--save-every", 2]
+    monkeypatch.setattr(sys, "argv", ["inpaint.py", *map(str, arguments_for(pipeline, tmp_path / "one", *data))])
+    inpaint.main()
+    assert list((tmp_path / "one").glob("**/events.out.tfevents.*")), "no TensorBoard log"
+    two = launch(arguments_for(pipeline, tmp_path / "two", *data), 2, script="trainers/inpaint.py")
+    assert two.returncode == 0, two.stderr[-3000:]
+    assert "step 2: holes of 1 pairs, PSNR" in two.stdout
+    folders = [tmp_path / run / "checkpoints" / "step-00000002" for run in ("one", "two")]
+    assert json.loads((folders[1] / "state.json").read_text())["world_size"] == 2
+    first, second, before = (weights(folder) for folder in (*(folder / "pipeline" for folder in folders), pipeline))
+    for name, weight in first.items():
+        assert torch.allclose(second[name], weight, atol=2e-4), name
+    assert max((first[name] - before[name]).abs().max() for name in first) > 1e-3
+    rows = [[json.loads(line) for line in (tmp_path / run / "validation.jsonl").read_text().splitlines()] for run in ("one", "two")]
+    assert [row["step"] for row in rows[0]] == [row["step"] for row in rows[1]] == [0, 2]
+    assert rows[0][0]["mean"] == pytest.approx(rows[1][0]["mean"], rel=1e-4)
+    assert re.search(r"the pipeline is .*two/checkpoints/step-00000002/pipeline", two.stdout)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ([], "nothing to learn from: name --photos or --datasets"),
+        (["--photos", "nowhere.tar"], "nowhere.tar"),
+        (["--datasets", "kitti=somewhere"], "takes KIND=FOLDER with one of sceneflow-clean"),
+        (["--datasets", "tartanair=nowhere"], "no folder nowhere"),
+        (["--datasets", "vkitti2=tests", "--pipeline", "nowhere"], "no pair of vkitti2 in tests"),
+    ],
+)
+def test_a_wrong_argument_is_one_line_in_words(monkeypatch, capsys, tmp_path, change, message):
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(sys, "argv", ["inpaint.py", *map(str, arguments_for("nowhere", tmp_path / "run")), *change])
+    with pytest.raises(SystemExit) as end:
+        run_trainer(inpaint.main)
+    assert message in str(end.value)
+
+
+def test_help_names_every_data_set_and_the_tar_layout(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["inpaint.py", "--help"])
+    with pytest.raises(SystemExit):
+        inpaint.main()
+    text = capsys.readouterr().out
+    for word in (
+        "sceneflow-final=FOLDER",
+        "tartanair=",
+        "crestereo=",
+        "vkitti2=",
+        "fallingthings=",
+        "KEY.disp.pfm",
+        "sd2-community",
+        "StereoGen",
+    ):
+        assert word in text

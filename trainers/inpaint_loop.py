@@ -1,0 +1,270 @@
+"""The fine-tuning of an inpainting U-Net on warped views (paper, section "Fine-tuning Protocol"): only the U-Net learns, to predict noise.
+
+A checkpoint is RUN/checkpoints/step-.../ with pipeline/, a whole pipeline in the diffusers format, training.pt and state.json.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from accelerate import Accelerator
+from accelerate.utils import gather_object
+from torch.utils.data import DataLoader
+from tqdm import tqdm
+
+from trainers import run_folder
+from trainers.hole_scores import HoleCase, hole_cases, mean_hole_scores, score_holes
+from trainers.inpaint_data.sources import ExampleBatch, Examples, requests
+from trainers.noise_prediction import NoisePrediction
+from trainers.pairs_on_disk import StereoPair
+from trainers.pipeline_folder import UNET, write_pipeline
+from trainers.weight_average import WeightAverage, weights_of
+from zsdata.faults import FailureBudget, FaultLog
+from zsdata.position import Position
+from zsdata.synthesis.inpaint import load_inpainter
+from zsdata.synthesis.inpaint.diffusion_parts import CELL_PX, load_diffusion_parts
+
+PIPELINE = "pipeline"  # the folder in a checkpoint
+LOG_EVERY_STEPS = 10
+PREFETCHED_BATCHES = 2  # per worker
+WARM_UP_SHARE = 0.01  # of the one-cycle, as published
+
+
+@dataclass(frozen=True, kw_only=True)
+class TuneConfig:
+    """How the U-Net is tuned; the defaults are the paper's (section "Implementation Details") and, beyond it, the published code's."""
+
+    steps: int = 50_000
+    batch_size: int = 32  # examples per optimizer step, over all ranks
+    micro_batch: int = 8  # examples at once on one rank; the rest is accumulated
+    learning_rate: float = 2e-5  # peak of the one-cycle
+    weight_decay: float = 1e-2
+    ema: float | None = None  # decay of an average of the weights, which is then what is saved and judged
+    gradient_checkpointing: bool = False  # less memory, a third more time
+    mixed_precision: str | None = None  # "no", "bf16", "fp16"; None takes what `accelerate launch` was told
+    workers: int = 8
+    save_every: int = 5_000
+    validation_steps: int = 50  # DDIM steps
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch_size", "micro_batch", "save_every", "validation_steps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is 1 or more; got {getattr(self, name)}")
+        if self.learning_rate <= 0:
+            raise ValueError(f"learning_rate is above 0; got {self.learning_rate}")
+        if self.workers < 0:
+            raise ValueError(f"workers is 0 or more; got {self.workers}")
+        if self.ema is not None and not 0 < self.ema < 1:
+            raise ValueError(f"ema is a decay in (0, 1), such as 0.9999; got {self.ema}")
+
+    def accumulate(self, ranks: int) -> int:
+        """Batches per optimizer step and rank."""
+        at_once = self.micro_batch * ranks
+        if self.batch_size % at_once:
+            raise ValueError(
+                f"batch_size {self.batch_size} is no multiple of micro_batch {self.micro_batch} times {ranks} ranks; change one of them"
+            )
+        return self.batch_size // at_once
+
+
+def tune(
+    pipeline: Path,
+    examples: Examples,
+    config: TuneConfig,
+    *,
+    output: Path,
+    arguments: dict[str, Any],
+    resume: Path | None = None,
+    pairs: list[StereoPair] | None = None,
+    tracker: str | None = "tensorboard",
+) -> Path:
+    """Tunes the U-Net of `pipeline` and returns the last checkpoint's pipeline folder, which `zsdata.load_inpainter` loads.
+
+    The examples of a step, their noise and their timesteps are functions of (seed, step, index): a resumed run goes on as if it had never
+    stopped, and other numbers of ranks or another micro_batch change it only by rounding.
+
+    Args:
+        pipeline: a local folder in the diffusers format.
+        examples: made for `config.seed` and `config.batch_size`.
+        output: the run's folder: checkpoints, tracker logs, log.jsonl, validation.jsonl.
+        arguments: what the run was started with, saved with its state.
+        resume: a run's folder or one of its checkpoints.
+        pairs: stereo pairs with dense ground truth; their holes are filled and judged before the first step and at every checkpoint.
+        tracker: any of Accelerate's, or None.
+
+    Raises:
+        ValueError, OSError: a pipeline that cannot be used, or a checkpoint of other data or options.
+        RuntimeError: the loss is not finite; it names the examples.
+    """
+    accelerator = Accelerator(
+        cpu=not torch.accelerator.is_available(),  # without it, ranks that torchrun starts on a CPU do not find each other
+        mixed_precision=config.mixed_precision,
+        log_with=tracker,
+        project_dir=str(output),
+    )
+    accumulate = accelerator.gradient_accumulation_steps = config.accumulate(accelerator.num_processes)
+    if any(side % CELL_PX for side in examples.size):
+        raise ValueError(f"crops are multiples of {CELL_PX} px high and wide; got {examples.size}")
+    parts = load_diffusion_parts(str(pipeline))
+    prediction = NoisePrediction(parts, accelerator.device, config.seed)
+    cases = _validation_cases(pairs, examples, accelerator)
+
+    unet, step, training = parts.unet, 0, None
+    if resume is not None:
+        checkpoint = run_folder.newest(resume)
+        training, state = run_folder.load(checkpoint)
+        step = state["step"]
+        if step >= config.steps:
+            raise ValueError(f"{checkpoint} has all of the {config.steps} steps already")
+        Position.from_state(state["examples"], examples.position(step))
+        unet = type(unet).from_pretrained(checkpoint / PIPELINE / UNET, use_safetensors=True)
+        accelerator.print(f"resumed from {checkpoint} at step {step}")
+    average = None if config.ema is None else WeightAverage(unet, config.ema)
+    if training is not None and training["weights"]:
+        unet.load_state_dict(training["weights"])
+    unet.requires_grad_(True).train()
+    if config.gradient_checkpointing:
+        unet.enable_gradient_checkpointing()
+    optimizer = torch.optim.AdamW(unet.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer,
+        config.learning_rate,
+        config.steps + 1,  # the last step too has a learning rate above 0
+        pct_start=WARM_UP_SHARE,
+        cycle_momentum=False,
+        anneal_strategy="linear",
+    )
+    if training is not None:
+        if training["schedule"]["total_steps"] != config.steps + 1:
+            raise ValueError(f"the run was planned for {training['schedule']['total_steps'] - 1} steps; resume it with that --steps")
+        optimizer.load_state_dict(training["optimizer"])
+        schedule.load_state_dict(training["schedule"])
+    model, optimizer = accelerator.prepare(unet, optimizer)
+    if training is not None and accelerator.scaler is not None and training["scaler"]:
+        accelerator.scaler.load_state_dict(training["scaler"])
+    if average is not None:
+        average.to(accelerator.device)
+
+    output.mkdir(parents=True, exist_ok=True)
+    if tracker is not None:
+        accelerator.init_trackers(output.name or "run", {name: value for name, value in asdict(config).items() if value is not None})
+
+    def save() -> Path:
+        if accelerator.is_main_process:
+            with weights_of(average, unet) as raw:
+                run_folder.write(
+                    output,
+                    step,
+                    lambda folder: write_pipeline(folder / PIPELINE, unet, pipeline),
+                    {
+                        "weights": raw,
+                        "optimizer": optimizer.state_dict(),
+                        "schedule": schedule.state_dict(),
+                        "scaler": accelerator.scaler.state_dict() if accelerator.scaler is not None else {},
+                    },
+                    {"examples": examples.position(step).to_state(), "world_size": accelerator.num_processes, "arguments": arguments},
+                )
+        accelerator.wait_for_everyone()
+        return run_folder.newest(output) / PIPELINE
+
+    def validate(folder: Path) -> None:
+        if cases:
+            scores = _validate(folder, cases, config, accelerator)
+            mean = mean_hole_scores(scores)
+            accelerator.log({f"hole_{name}": value for name, value in mean.items()}, step=step)
+            accelerator.print(f"step {step}: holes of {len(scores)} pairs, PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.3f}")
+            if accelerator.is_main_process:
+                _append(output / "validation.jsonl", {"step": step, "mean": mean, "pairs": scores})
+
+    saved = output
+    if training is None:
+        validate(pipeline)
+    faults = FaultLog(FailureBudget())
+    batches = iter(_loader(examples, config, step, accelerator))
+    progress = tqdm(total=config.steps, initial=step, unit="step", disable=not accelerator.is_main_process, dynamic_ncols=True)
+    mark, waited = (step, time.perf_counter()), 0.0
+    while step < config.steps:
+        losses = []
+        for _ in range(accumulate):
+            begin = time.perf_counter()
+            batch: ExampleBatch = next(batches)
+            waited += time.perf_counter() - begin
+            faults.add(len(batch.requests), batch.rejected)
+            with accelerator.accumulate(model):
+                with accelerator.autocast():
+                    loss = prediction.loss(model, batch)
+                if not math.isfinite(loss.item()):
+                    raise RuntimeError(f"the loss is {loss.item()} at step {step}; examples: {', '.join(batch.places)}")
+                accelerator.backward(loss)
+                optimizer.step()
+                optimizer.zero_grad()
+            losses.append(loss.detach())
+        schedule.step()
+        step += 1
+        if average is not None:
+            average.update(unet, step)
+        progress.update()
+        if step % LOG_EVERY_STEPS == 0 or step == config.steps:
+            elapsed = time.perf_counter() - mark[1]
+            values = {
+                "loss": float(accelerator.reduce(torch.stack(losses).mean(), reduction="mean")),  # type: ignore[arg-type]
+                "learning_rate": schedule.get_last_lr()[0],
+                "examples_per_second": (step - mark[0]) * config.batch_size / elapsed,
+                "wait_share": waited / elapsed,
+            }
+            mark, waited = (step, time.perf_counter()), 0.0
+            progress.set_postfix_str(
+                f"loss {values['loss']:.4f}, {values['examples_per_second']:.1f} examples/s, waiting {values['wait_share']:.0%}"
+            )
+            if accelerator.is_main_process:
+                _append(output / "log.jsonl", {"step": step, **values})
+            accelerator.log(values, step=step)
+        if step % config.save_every == 0 or step == config.steps:
+            saved = save()
+            validate(saved)
+    progress.close()
+    accelerator.end_training()
+    return saved
+
+
+def _loader(examples: Examples, config: TuneConfig, step: int, accelerator: Accelerator) -> DataLoader:
+    asked = requests(step, config.steps, config.batch_size, config.micro_batch, accelerator.process_index, accelerator.num_processes)
+    return DataLoader(
+        examples,
+        batch_sampler=asked,  # type: ignore[arg-type]  # any iterable of lists of what the data set is asked for
+        num_workers=config.workers,
+        collate_fn=ExampleBatch.stack,
+        pin_memory=accelerator.device.type == "cuda",
+        prefetch_factor=PREFETCHED_BATCHES if config.workers else None,
+    )
+
+
+def _validation_cases(pairs: list[StereoPair] | None, examples: Examples, accelerator: Accelerator) -> list[HoleCase]:
+    cases, left_out = hole_cases(pairs or [], examples.size)
+    if left_out:
+        accelerator.print(f"not judged, for want of dense ground truth or of holes: {', '.join(left_out)}")
+    if pairs and not cases:
+        raise ValueError("none of the pairs to validate on has dense ground truth and holes to judge")
+    return cases
+
+
+def _validate(folder: Path, cases: list[HoleCase], config: TuneConfig, accelerator: Accelerator) -> list[dict[str, Any]]:
+    """Scores of the saved pipeline, shared out over the ranks; loaded as a user loads it."""
+    mine = list(enumerate(cases))[accelerator.process_index :: accelerator.num_processes]
+    scores = []
+    if mine:
+        inpaint = load_inpainter(folder, accelerator.device, steps=config.validation_steps)
+        scores = [(number, score_holes(inpaint, case, number, config.seed)) for number, case in mine]
+    return [score for _, score in sorted(gather_object(scores), key=lambda entry: entry[0])]
+
+
+def _append(path: Path, values: dict[str, Any]) -> None:
+    with path.open("a") as file:
+        file.write(json.dumps(values) + "\n")
