@@ -61,6 +61,53 @@ def test_the_first_photo_of_a_key_is_kept_and_the_second_reported(shard):
     assert [fault.reason for fault in faults] == ['duplicate key ("a")'] * 2
 
 
+def test_a_sample_whose_photo_is_missing_is_reported_with_its_key(shard):
+    url = shard(
+        ("0.jpg", b"0"), ("0.json", b"{}"), ("1.json", b"{}"), ("1.txt", b""), ("2.tif", b""), ("2.json", b"{}"), ("readme.md", b"")
+    )
+    faults = []
+    assert list(read_shard(url, faults.append)) == [("0", b"0")]
+    assert [fault.reason for fault in faults] == ['not a JPEG, PNG or WebP: .tif ("2")', 'no photo: only .json, .txt ("1")']
+
+
+def test_a_photo_with_a_dot_in_its_stem_is_reported_as_no_other_tool_finds_it_either(shard):
+    faults = []
+    assert not list(
+        read_shard(
+            shard(
+                ("2024.05.01.jpg", b"0"),
+            ),
+            faults.append,
+        )
+    )
+    assert [fault.reason for fault in faults] == [
+        'no photo: the extension begins at the first dot of the name, .05.01.jpg; rename it ("2024")'
+    ]
+
+
+def test_a_photo_that_swallowed_the_next_member_is_damage(shard):
+    url = shard(("a.jpg", b"a" * 1200), ("b.jpg", b"b" * 500), ("c.jpg", b"c"))
+    with open(url, "rb") as file:
+        data = file.read()
+    with open(url, "wb") as file:
+        file.write(data[:600] + data[600 + 1024 :] + bytes(1024))  # as long as b.jpg with its header: c.jpg follows in its place
+    faults = []
+    assert list(read_shard(url, faults.append)) == [("c", b"c")]
+    assert [fault.reason for fault in faults] == ['"a" holds the header of another member; download it again']
+    with pytest.raises(BadShard, match="the header of another member"):
+        list(read_shard(url))
+
+
+def test_a_shard_that_was_not_written_to_its_end_is_damage_even_where_a_photo_began(shard):
+    url = shard(("a.jpg", b"a" * 600), ("b.jpg", b"b" * 600), ("c.jpg", b"c" * 600))
+    with open(url, "r+b") as file:
+        file.seek(512 + 1024 + 512 + 100)
+        file.write(bytes(512 * 5))
+    faults = []
+    assert [key for key, _ in read_shard(url, faults.append)] == ["a", "b"]
+    assert [fault.reason for fault in faults] == ['zeros from inside "b" to the end: more may be missing; download it again']
+
+
 def test_other_image_formats_are_reported_by_name(shard):
     faults = []
     assert not list(read_shard(shard(("a.tif", b""), ("b.GIF", b""), ("c.heic", b"")), faults.append))

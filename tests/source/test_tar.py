@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zsdata.faults import BadShard
+from zsdata.source import tar
 from zsdata.source.ranges import ShardFile
 from zsdata.source.tar import MAX_EXTENSION_BYTES, walk_tar
 
@@ -100,7 +101,8 @@ def test_a_member_whose_long_name_header_is_wiped_out_gets_no_other_name(archive
     data = bytearray(write_tar([("a.jpg", b"a"), (name, b"b"), ("c.jpg", b"c")], archive_format))
     data[1024 : 1024 + 512] = wiped
     faults = []
-    assert walk(bytes(data), faults.append) == [("a.jpg", b"a"), ("c.jpg", b"c")]
+    assert walk(bytes(data), faults.append)[-1] == ("c.jpg", b"c")
+    assert set(walk(bytes(data), faults.append)) <= {("a.jpg", b"a"), ("c.jpg", b"c")}
     assert faults
 
 
@@ -120,10 +122,36 @@ def test_a_cut_at_any_byte_is_reported_and_yields_whole_members_only(archive_for
             walk(data[:cut])
 
 
-def test_the_end_is_one_block_of_zeros_or_more():
-    data = write_tar([("a.jpg", b"a")])
-    for end in (1024 + 512, 1024 + 513, 2048, 3000):
-        assert walk(data[:end]) == [("a.jpg", b"a")]
+@pytest.mark.parametrize("size", [1024 + 512, 2048, 10_240, 2**14, 2**20])
+def test_an_archive_ends_in_one_or_two_blocks_of_zeros_or_fills_its_record(size):
+    assert walk(write_tar([("a.jpg", b"a")])[:1024] + bytes(size - 1024)) == [("a.jpg", b"a")]
+
+
+@pytest.mark.parametrize("size", [1024 + 513, 3000, 2560, 10_239, 10_752, 30_720, 2**20 + 10_240, 2**21])
+def test_zeros_that_no_writer_leaves_are_damage_and_cast_doubt_on_the_last_member(size):
+    data = write_tar([("a.jpg", b"a"), ("b.jpg", b"b")])[:2048] + bytes(size - 1024)
+    faults = []
+    assert walk(data, faults.append) == [("a.jpg", b"a")]
+    assert ["zeros at its end" in fault.reason or '"b.jpg" does not end' in fault.reason for fault in faults] == [True, True]
+    with pytest.raises(BadShard, match="zeros at its end, which no tar writes"):
+        walk(data)
+
+
+def test_an_endless_hole_behind_the_archive_is_not_read_to_its_end(monkeypatch):
+    class Hole(BytesShard):
+        read = 0
+
+        def read_at(self, offset, size):
+            data = super().read_at(offset, size)
+            self.read += size
+            return data + bytes(min(size, self.size - offset) - len(data))
+
+    monkeypatch.setattr(tar, "MAX_SEARCH_BYTES", 1 << 24)
+    shard = Hole(write_tar([("a.jpg", b"a")]))
+    shard.size = 1 << 50
+    with pytest.raises(BadShard, match="zeros at its end"):
+        list(walk_tar(shard))
+    assert shard.read < 1 << 25
 
 
 @pytest.mark.parametrize("zeros", [512, 1024, 4096])
@@ -146,6 +174,38 @@ def test_the_walk_goes_on_behind_a_damaged_header():
     assert [(fault.offset, fault.shard) for fault in faults] == [(1536, "memory.tar")]
     with pytest.raises(BadShard, match=r"memory.tar at byte 1,536: damaged header"):
         walk(bytes(data))
+
+
+@pytest.mark.parametrize("lost", [-700, -512, -1, 1, 300, 512, 1024])
+@pytest.mark.parametrize("place", [600, 1100, 1300])
+def test_bytes_lost_or_inserted_in_a_member_cost_that_member_and_no_other(place, lost):
+    entries = [("a.jpg", bytes(range(1, 256)) * 8), ("b.jpg", b"b" * 600), ("c.jpg", b"c")]
+    data = write_tar(entries)
+    damaged = data[:place] + b"x" * lost + data[place + max(0, -lost) :]
+    faults = []
+    assert walk(damaged, faults.append) == entries[1:]
+    assert '"a.jpg" does not end where its size says' in faults[0].reason
+    with pytest.raises(BadShard):
+        walk(damaged)
+
+
+def test_a_header_that_is_a_byte_off_is_none_though_its_sum_fits():
+    data = write_tar([("a.jpg", b"abc"), ("b.jpg", b"b" * 600)])
+    moved = data[:513] + data[514:1600] + b"b" + data[1600:]
+    assert sum(moved[1024:1536]) == sum(data[1024:1536])
+    faults = []
+    assert walk(moved, faults.append) == [("b.jpg", b"b" * 600)]
+    assert len(faults) == 2
+
+
+def test_what_lies_in_a_nested_archive_is_never_found_even_when_its_header_is_damaged():
+    inner = write_tar([("inner.jpg", b"x" * 3000), ("more.jpg", b"y")])
+    data = write_tar([("a.jpg", b"a"), ("inner.tar", inner), ("b.jpg", b"b"), ("c.jpg", b"c")])
+    header = data.index(b"inner.tar")
+    for wiped in (data[header : header + 100] + b"9" + data[header + 101 : header + 512], bytes(512), b"\xff" * 512):
+        faults = []
+        found = walk(data[:header] + wiped + data[header + 512 :], faults.append)
+        assert faults and set(found) <= {("a.jpg", b"a"), ("b.jpg", b"b"), ("c.jpg", b"c")} and found[-1] == ("c.jpg", b"c")
 
 
 def test_the_inside_of_a_cut_off_archive_is_not_searched():

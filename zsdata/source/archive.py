@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from zsdata.faults import BadShard
 from zsdata.source.ranges import ShardFile, ends_inside
-from zsdata.source.tar import walk_tar
+from zsdata.source.tar import find_header, walk_tar
 
 PHOTO_EXTENSIONS = frozenset({"jpg", "jpeg", "png", "webp"})
 OTHER_IMAGE_EXTENSIONS = frozenset(  # of files that a user may take for photos of the source; they are counted, not passed over
@@ -71,7 +71,8 @@ def photo_members(file: ShardFile, on_problem: Callable[[Problem], None], *, str
     """The photos of an open shard: regular members with the extension jpg, jpeg, png or webp.
 
     Args:
-        on_problem: gets the damages, and each member that is meant as a photo but is none: the second of a key, a link, another format.
+        on_problem: gets the damages, each member that is meant as a photo but is none (the second of a key, a link, another format), and
+            each sample without a photo.
         strict: damage raises instead.
 
     Raises:
@@ -82,7 +83,11 @@ def photo_members(file: ShardFile, on_problem: Callable[[Problem], None], *, str
         on_problem(Problem(fault.shard, None, fault.offset, fault.reason))
 
     keys: set[str] = set()
+    refused: set[str] = set()
+    beside: dict[str, _Beside] = {}
+    last: PhotoMember | None = None
     for member in walk_tar(file, None if strict else on_damage):
+        last = None
         named = split_name(member.name)
         if named is None or member.kind == "folder":
             continue
@@ -96,13 +101,50 @@ def photo_members(file: ShardFile, on_problem: Callable[[Problem], None], *, str
                 reason = f"too large: {member.size:,} bytes, at most {MAX_PHOTO_BYTES:,}"
             else:
                 keys.add(key)
-                yield PhotoMember(key, member.offset, member.size)
+                last = PhotoMember(key, member.offset, member.size)
+                yield last
                 continue
         elif extension in OTHER_IMAGE_EXTENSIONS:
             reason = f"not a JPEG, PNG or WebP: .{extension}"
         else:
+            beside.setdefault(key, _Beside(member.offset, [])).extensions.append(extension)
             continue
+        refused.add(key)
         on_problem(Problem(file.url, key, member.offset, reason))
+    if last is not None and last.size and _ends_in_zeros(file, last):
+        end = last.offset + last.size
+        fault = BadShard(f'zeros from inside "{last.key}" to the end: more may be missing; download it again', file.url, end)
+        if strict:
+            raise fault
+        on_damage(fault)
+    for problem in _without_photo(file.url, keys, refused, beside):
+        on_problem(problem)
+
+
+def _ends_in_zeros(file: ShardFile, photo: PhotoMember) -> bool:
+    """No JPEG, PNG or WebP does."""
+    size = min(photo.size, 64)
+    return not file.read_at(photo.offset + photo.size - size, size).strip(b"\0")
+
+
+class _Beside(NamedTuple):
+    """What a sample has beside its photo: where the first of it lies, and the extensions."""
+
+    offset: int
+    extensions: list[str]
+
+
+def _without_photo(url: str, keys: set[str], refused: set[str], beside: dict[str, _Beside]) -> Iterator[Problem]:
+    """The samples whose photo is missing: they have an annotation as the photos of this shard have it, or a photo by another name."""
+    usual = {extension for key in keys & beside.keys() for extension in beside[key].extensions}
+    for key, (offset, extensions) in beside.items():
+        if key in keys or key in refused:
+            continue
+        dotted = next((extension for extension in extensions if extension.rpartition(".")[2] in PHOTO_EXTENSIONS), None)
+        if dotted is not None and dotted not in usual:
+            yield Problem(url, key, offset, f"no photo: the extension begins at the first dot of the name, .{dotted}; rename it")
+        elif not usual.isdisjoint(extensions):
+            yield Problem(url, key, offset, f"no photo: only {', '.join('.' + extension for extension in extensions)}")
 
 
 def read_shard(url: str, on_damage: Callable[[BadShard], None] | None = None) -> Iterator[tuple[str, bytes]]:
@@ -130,4 +172,16 @@ def read_shard(url: str, on_damage: Callable[[BadShard], None] | None = None) ->
             data = file.read_at(offset, size)
             if len(data) < size:
                 raise ends_inside(url, f'"{key}"', offset, size, len(data))
-            yield key, data
+            fault = header_inside(url, key, offset, data)
+            if fault is None:
+                yield key, data
+            elif on_damage is None:
+                raise fault
+            else:
+                on_damage(fault)
+
+
+def header_inside(url: str, key: str, offset: int, data: bytes) -> BadShard | None:
+    """The fault of a photo that holds a tar header: bytes went missing from the shard, and other members moved into it."""
+    found = find_header(data)
+    return None if found < 0 else BadShard(f'"{key}" holds the header of another member; download it again', url, offset + found)

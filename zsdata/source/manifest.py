@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import sys
+import zlib
 from array import array
 from collections import Counter
 from collections.abc import Sequence
@@ -14,10 +16,16 @@ from typing import NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from zsdata.source.archive import Problem, photo_members
+from zsdata.faults import BadPhoto
+from zsdata.source.archive import Problem, header_inside
+from zsdata.source.index import CHECKSUM_UNKNOWN, load_or_list
 from zsdata.source.ranges import ShardFile, read_range
 from zsdata.source.tar import walk_tar
 from zsdata.source.urls import base_name, expand_urls
+
+logger = logging.getLogger("zsdata")
+
+CHANGED_BYTES = "damaged: other bytes than when the shard was indexed"
 
 
 class Member(NamedTuple):
@@ -46,6 +54,7 @@ class Manifest:
     key_ends: np.ndarray  # [N] int64, into key_text
     problems: tuple[Problem, ...]
     digest: str
+    checksums: np.ndarray | None = None  # [N] int64, CRC-32 of the bytes where an index knows it, else CHECKSUM_UNKNOWN
 
     def __len__(self) -> int:
         """How many photos."""
@@ -60,13 +69,26 @@ class Manifest:
         return Member(self.shard_urls[self.shard_numbers[index]], key, int(self.offsets[index]), int(self.sizes[index]))
 
     def read(self, index: int) -> bytes:
-        """The bytes of photo `index`, read by range; raises BadShard if the shard no longer has all of them."""
+        """The bytes of photo `index`, read by range.
+
+        Raises:
+            BadShard: the shard no longer has all of them, or another member has moved into them.
+            BadPhoto: they are not those that were indexed.
+        """
         url, key, offset, size = self.member(index)
-        return read_range(url, offset, size, inside=f'"{key}"')
+        data = read_range(url, offset, size, inside=f'"{key}"')
+        checksum = CHECKSUM_UNKNOWN if self.checksums is None else int(self.checksums[index])
+        if checksum == CHECKSUM_UNKNOWN:
+            fault = header_inside(url, key, offset, data)
+            if fault is not None:
+                raise fault
+        elif zlib.crc32(data) != checksum:
+            raise BadPhoto(CHANGED_BYTES, key)
+        return data
 
 
 def build_manifest(urls: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], progress: bool = False) -> Manifest:
-    """Walks the headers of a source's shards.
+    """Lists the photos of a source's shards: from their indexes where they have them (`write_index`), else from their headers.
 
     Args:
         urls: as `expand_urls` takes them.
@@ -78,19 +100,24 @@ def build_manifest(urls: str | os.PathLike[str] | Sequence[str | os.PathLike[str
     """
     shard_urls = expand_urls(urls)
     shard_sizes: list[int] = []
-    shard_numbers, offsets, sizes, key_ends = array("i"), array("q"), array("i"), array("q")
+    shard_numbers, offsets, sizes, key_ends, checksums = array("i"), array("q"), array("i"), array("q"), array("q")
     key_text = bytearray()
     problems: list[Problem] = []
+    stale: list[str] = []
     hidden = not (progress or (len(shard_urls) > 1 and sys.stderr.isatty()))
-    for number, url in enumerate(tqdm(shard_urls, desc="indexing", unit="shard", disable=hidden)):
-        with ShardFile(url) as file:
-            shard_sizes.append(file.size)
-            for key, offset, size in photo_members(file, problems.append):
-                key_text += key.encode("utf-8", "surrogateescape")
-                shard_numbers.append(number)
-                offsets.append(offset)
-                sizes.append(size)
-                key_ends.append(len(key_text))
+    listings = load_or_list(shard_urls, stale)
+    for number, listing in enumerate(tqdm(listings, desc="indexing", unit="shard", total=len(shard_urls), disable=hidden)):
+        shard_sizes.append(listing.size)
+        problems += listing.problems
+        shard_numbers.extend([number] * len(listing.keys))
+        offsets.extend(listing.offsets)
+        sizes.extend(listing.sizes)
+        checksums.extend(listing.checksums)
+        for key in listing.keys:
+            key_text += key.encode("utf-8", "surrogateescape")
+            key_ends.append(len(key_text))
+    if stale:
+        logger.warning("%d of %d indexes are not used, the first as %s; `zsdata index` renews them", len(stale), len(shard_urls), stale[0])
     if not offsets:
         raise ValueError(_nothing_found(shard_urls, problems))
     columns = {
@@ -104,6 +131,7 @@ def build_manifest(urls: str | os.PathLike[str] | Sequence[str | os.PathLike[str
         shard_urls=tuple(shard_urls),
         shard_sizes=tuple(shard_sizes),
         problems=tuple(problems),
+        checksums=np.array(checksums, np.int64),
         digest=_digest(shard_urls, shard_sizes, columns),
         **columns,
     )

@@ -1,0 +1,245 @@
+"""The index of a shard: its photos and their checksums, stored once, so that opening the shard again reads no headers."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import zlib
+from array import array
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from fsspec.core import url_to_fs
+from tqdm import tqdm
+
+from zsdata.source.archive import MAX_PHOTO_BYTES, Problem, header_inside, photo_members
+from zsdata.source.ranges import ShardFile
+from zsdata.source.urls import base_name, expand_urls, local_path
+
+VERSION = 1
+MAX_INDEX_BYTES = 1 << 28  # 256 MiB; a photo takes about 50 bytes
+CHECKSUM_UNKNOWN = -1
+REMOTE_AT_ONCE = 16  # shards asked for their state at the same time
+_REMOTE_STAMPS = ("ETag", "etag", "Content-MD5", "md5Hash", "Last-Modified", "LastModified", "updated", "blob_id", "mtime", "created")
+
+
+@dataclass
+class Listing:
+    """The photos of one shard in order; `problems` is what could not be taken."""
+
+    size: int  # bytes of the shard
+    keys: list[str] = field(default_factory=list)
+    offsets: array[int] = field(default_factory=lambda: array("q"))
+    sizes: array[int] = field(default_factory=lambda: array("i"))
+    checksums: array[int] = field(default_factory=lambda: array("q"))  # CRC-32 of the bytes, or CHECKSUM_UNKNOWN
+    problems: list[Problem] = field(default_factory=list)
+
+
+@dataclass
+class IndexReport:
+    """What `write_index` wrote and found."""
+
+    shards: int = 0
+    photos: int = 0
+    bytes: int = 0  # of the shards
+    unchanged: int = 0  # shards whose index was up to date
+    files: list[str] = field(default_factory=list)
+    problems: list[Problem] = field(default_factory=list)
+
+
+def list_shard(url: str, checksums: bool = False) -> Listing:
+    """Walks the headers of a shard; with `checksums` it reads the photos too. Raises what opening it raises."""
+    with ShardFile(url) as file:
+        listing = Listing(file.size)
+        for key, offset, size in photo_members(file, listing.problems.append):
+            checksum = CHECKSUM_UNKNOWN
+            if checksums:
+                data = file.read_at(offset, size)
+                fault = header_inside(url, key, offset, data)
+                if fault is not None:
+                    listing.problems.append(Problem(url, key, fault.offset, fault.reason))
+                    continue
+                checksum = zlib.crc32(data)
+            listing.keys.append(key)
+            listing.offsets.append(offset)
+            listing.sizes.append(size)
+            listing.checksums.append(checksum)
+    return listing
+
+
+def write_index(urls: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], progress: bool | None = None) -> IndexReport:
+    """Stores an index for each shard of a source: SHARD.index.json beside a local one, in the cache for a remote one or a folder that
+    cannot be written. The cache is $ZSDATA_CACHE, or zsdata in the user's cache folder. An index that is up to date stays.
+
+    Args:
+        urls: as `expand_urls` takes them.
+        progress: show a progress bar; by default where stderr is a terminal.
+
+    Raises:
+        OSError: a shard cannot be read, or changed while it was read.
+        ValueError, FileNotFoundError: as `expand_urls` raises them.
+    """
+    report = IndexReport()
+    for url in tqdm(expand_urls(urls), desc="indexing", unit="shard", disable=None if progress is None else not progress):
+        try:
+            listing, unchanged = load_listing(url), True
+        except StaleIndex:
+            listing, unchanged = None, False
+        if listing is None:
+            stamp = _stamp(url)
+            listing, unchanged = list_shard(url, checksums=True), False
+            if _stamp(url) != stamp:
+                raise OSError(f"{url} changed while it was indexed; run this again when nothing writes to it")
+            report.files.append(_store(url, _to_json(url, stamp, listing)))
+        report.shards += 1
+        report.unchanged += unchanged
+        report.photos += len(listing.keys)
+        report.bytes += listing.size
+        report.problems += listing.problems
+    return report
+
+
+class StaleIndex(Exception):
+    """An index that is there and cannot be used, and why."""
+
+
+def load_listing(url: str, *, even_if_touched: bool = False) -> Listing | None:
+    """What the index of a shard says; None without an index.
+
+    Args:
+        even_if_touched: take it where only the time of the shard has changed, not its size.
+
+    Raises:
+        StaleIndex: the shard has changed, or the index is damaged or of another version.
+        OSError: the shard is not there.
+    """
+    for path in _places(url):
+        try:
+            if os.path.getsize(path) > MAX_INDEX_BYTES:
+                raise StaleIndex(f"{path} is too large for an index")
+            text = Path(path).read_bytes()
+        except OSError:  # not there, or not for us to read
+            continue
+        try:
+            stamp, listing = _from_json(url, text)
+        except (ValueError, RecursionError) as error:
+            raise StaleIndex(f"{path} is no index of version {VERSION}, or damaged ({error})") from error
+        now = _stamp(url)
+        if now != stamp and not (even_if_touched and now["size"] == stamp["size"]):
+            raise StaleIndex(f"{path} is older than its shard")
+        return listing
+    return None
+
+
+def load_or_list(urls: Sequence[str], stale: list[str]) -> Iterable[Listing]:
+    """The listing of each shard in order, from its index where it has one; adds to `stale` why an index was not used."""
+
+    def one(url: str) -> Listing:
+        try:
+            listing = load_listing(url)
+        except StaleIndex as reason:
+            stale.append(str(reason))
+            listing = None
+        return list_shard(url) if listing is None else listing
+
+    if all(local_path(url) is not None for url in urls):
+        yield from map(one, urls)
+        return
+    with ThreadPoolExecutor(REMOTE_AT_ONCE) as threads:
+        yield from threads.map(one, urls)
+
+
+def _places(url: str) -> list[str]:
+    """Where the index of a shard may be, the first one preferred."""
+    path = local_path(url)
+    identity = os.path.realpath(path) if path is not None else url.split("?", 1)[0]
+    cached = f"{hashlib.sha256(identity.encode('utf-8', 'surrogateescape')).hexdigest()[:32]}-{base_name(url)}.index.json"
+    cache = os.environ.get("ZSDATA_CACHE") or os.path.join(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "zsdata")
+    return [*([] if path is None else [f"{path}.index.json"]), os.path.join(cache, "index", cached)]
+
+
+def _stamp(url: str) -> dict[str, Any]:
+    """What changes with the shard: its size, and its time or the server's tag."""
+    path = local_path(url)
+    if path is not None:
+        state = os.stat(path)
+        return {"size": state.st_size, "modified_ns": state.st_mtime_ns}
+    with ShardFile(url) as file:  # which also says what a url needs
+        size = file.size
+    file_system, remote_path = url_to_fs(url)
+    info = file_system.info(remote_path)
+    found = next((name for name in _REMOTE_STAMPS if info.get(name)), None)
+    return {"size": size} if found is None else {"size": size, found: str(info[found])}
+
+
+def _store(url: str, text: str) -> str:
+    """Writes an index where it may be; whoever reads at the same time gets the old one or the new one."""
+    *places, last = _places(url)
+    for path in (*places, last):
+        partial = f"{path}.{os.getpid()}.partial"
+        try:
+            if path == last:
+                os.makedirs(os.path.dirname(path), exist_ok=True)
+            try:
+                Path(partial).write_text(text, encoding="ascii")
+                os.replace(partial, path)
+            finally:
+                Path(partial).unlink(missing_ok=True)
+            return path
+        except OSError:
+            if path == last:
+                raise
+    raise AssertionError("unreachable")
+
+
+def _to_json(url: str, stamp: dict[str, Any], listing: Listing) -> str:
+    content = {
+        "zsdata_index": VERSION,
+        "shard": base_name(url),
+        "stamp": stamp,
+        "keys": listing.keys,
+        "offsets": listing.offsets.tolist(),
+        "sizes": listing.sizes.tolist(),
+        "crc32": listing.checksums.tolist(),
+        "problems": [[problem.key, problem.offset, problem.reason] for problem in listing.problems],
+    }
+    return json.dumps({**content, "sha256": _digest(content)}, separators=(",", ":"))
+
+
+def _digest(content: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def _from_json(url: str, text: bytes) -> tuple[dict[str, Any], Listing]:
+    """The stamp and the listing; ValueError for anything that `_to_json` would not have written."""
+    content = json.loads(text)
+    if not isinstance(content, dict) or content.get("zsdata_index") != VERSION:
+        raise ValueError("another version")
+    if content.pop("sha256", None) != _digest(content):
+        raise ValueError("wrong checksum")
+    if content.get("shard") != base_name(url):
+        raise ValueError(f"it belongs to {content.get('shard')!r}")
+    try:
+        stamp, keys = content["stamp"], content["keys"]
+        offsets, sizes, checksums = array("q", content["offsets"]), array("i", content["sizes"]), array("q", content["crc32"])
+        problems = [Problem(url, key, offset, reason) for key, offset, reason in content["problems"]]
+        size = stamp["size"]
+        in_order = (
+            isinstance(size, int)
+            and len(keys) == len(set(keys)) == len(offsets) == len(sizes) == len(checksums)
+            and all(before + length <= after for before, length, after in zip(offsets, sizes, [*offsets[1:], size], strict=True))
+        )
+        in_range = all(0 <= length <= MAX_PHOTO_BYTES for length in sizes) and all(0 <= crc < 1 << 32 for crc in checksums)
+        told = all(isinstance(key, str) for key in keys) and all(
+            isinstance(problem.key, str | None) and isinstance(problem.offset, int) and isinstance(problem.reason, str)
+            for problem in problems
+        )
+    except (KeyError, TypeError, OverflowError) as error:
+        raise ValueError("a field is missing or of another type") from error
+    if not (in_order and in_range and told and (not offsets or offsets[0] >= 0)):
+        raise ValueError("members overlap or lie outside of the shard")
+    return stamp, Listing(size, keys, offsets, sizes, checksums, problems)
