@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import weakref
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,7 @@ from hypothesis import strategies as st
 
 from tests import oracles_loss
 from tests.published import published_values
-from zsdata.losses import photometric_loss, sequence_weights, zero_stereo_loss
+from zsdata.losses import photometric_loss, sequence_weights, window_means, zero_stereo_loss
 from zsdata.sample import Masks
 from zsdata.synthesis.backward_warp import backward_warp
 
@@ -124,7 +126,9 @@ def test_the_published_loss_with_an_initial_prediction_is_reproduced(published):
 def test_the_published_photometric_map_is_reproduced(published):
     values, _ = published
     photometric = photometric_loss(values["left"], backward_warp(values["right"], values["disparity"]))
-    torch.testing.assert_close(photometric, values["photometric"], atol=1e-5, rtol=0)
+    exact = photometric_loss(values["left"].double(), backward_warp(values["right"].double(), values["disparity"].double()))
+    torch.testing.assert_close(photometric, exact.float(), atol=1e-5, rtol=0)
+    torch.testing.assert_close(photometric, values["photometric"], atol=2e-5, rtol=0)  # which is 1.9e-5 off in float32 itself
 
 
 def test_sequence_weights_start_at_gamma_to_the_15th_and_end_at_one():
@@ -178,8 +182,115 @@ def test_metrics_are_of_the_last_prediction_over_valid_pixels():
 
 
 def test_no_photometric_term_is_computed_when_mu_is_zero(monkeypatch):
-    monkeypatch.setattr("zsdata.losses.photometric_loss", lambda *_: pytest.fail("computed"))
+    monkeypatch.setattr("zsdata.losses._photometric_loss", lambda *_: pytest.fail("computed"))
     zero_stereo_loss(**random_case(1), mu=0.0)
+
+
+def plain_loss(case: dict, mu: float, beta: float) -> torch.Tensor:
+    """The loss with an ordinary SSIM, left to autograd; without an initial prediction, every label valid."""
+    masks = case["masks"]
+    weights = sequence_weights(len(case["predictions"]), 0.9)
+    left, right = case["left_clean"].double() / 255, case["right_clean"].double() / 255
+    known = backward_warp((~masks.inpaint).double(), case["disparity"], mode="nearest", padding="zeros") > 0
+    judged = (masks.nonocclusion & known).double()
+
+    def window_mean(image: torch.Tensor) -> torch.Tensor:
+        return torch.nn.functional.avg_pool2d(torch.nn.functional.pad(image, (3, 3, 3, 3), mode="reflect"), 7, stride=1)
+
+    total = left.new_zeros(())
+    for weight, prediction in zip(weights, case["predictions"], strict=True):
+        seen = backward_warp(right, prediction.double())
+        a, b = window_mean(left), window_mean(seen)
+        variances = window_mean(left**2) - a**2 + window_mean(seen**2) - b**2
+        covariance = window_mean(left * seen) - a * b
+        ssim = (2 * a * b + 0.01**2) * (2 * covariance + 0.03**2) / ((a**2 + b**2 + 0.01**2) * (variances + 0.03**2))
+        photometric = (beta * ((1 - ssim) / 2).clamp(0, 1) + (1 - beta) * (left - seen).abs()).mean(1, keepdim=True)
+        disparity_term = (case["confidence"] * (prediction - case["disparity"]).abs()).mean()
+        total = total + weight * (disparity_term + mu * ((1 - case["confidence"]) * photometric * judged).sum() / judged.sum())
+    return total
+
+
+def test_the_gradient_found_at_once_is_that_of_autograd():
+    case = random_case(11, ("random", "random", "all"), size=(12, 17))
+    case["initial_prediction"] = None
+    gradients = []
+    for loss in (3 * zero_stereo_loss(**case, mu=2.0, beta=0.7)[0], 3 * plain_loss(case, mu=2.0, beta=0.7)):
+        for prediction in case["predictions"]:
+            prediction.grad = None
+        loss.backward()
+        gradients.append(torch.stack([prediction.grad for prediction in case["predictions"]]))
+    assert gradients[1].abs().max() > 1e-3
+    torch.testing.assert_close(gradients[0], gradients[1], atol=1e-6, rtol=1e-4)
+
+
+def test_window_means_are_those_of_a_pooling_with_its_gradient():
+    image = torch.rand(2, 3, 9, 4, dtype=torch.float64, requires_grad=True)
+    pooled = torch.nn.functional.avg_pool2d(torch.nn.functional.pad(image, (3, 3, 3, 3), mode="reflect"), 7, stride=1)
+    torch.testing.assert_close(window_means(image), pooled)
+    assert torch.autograd.gradcheck(window_means, image)
+
+
+class Saved:
+    def __init__(self, tensor: torch.Tensor) -> None:
+        self.tensor = tensor
+
+
+def test_the_backward_pass_keeps_no_image_per_prediction():
+    case = random_case(9, size=(16, 16), n=12)
+    alive: weakref.WeakSet[Saved] = weakref.WeakSet()
+
+    def save(tensor: torch.Tensor) -> Saved:
+        saved = Saved(tensor)
+        alive.add(saved)
+        return saved
+
+    with torch.autograd.graph.saved_tensors_hooks(save, lambda saved: saved.tensor):
+        loss, _ = zero_stereo_loss(**case)
+    kept = {saved.tensor.data_ptr(): saved.tensor.numel() for saved in alive}
+    assert loss.requires_grad and 0 < sum(kept.values()) / case["disparity"].numel() < 4 * 13  # an SSIM alone is made of some 50 maps
+
+
+def test_the_ordinary_photometric_term_counts_every_pixel_alike():
+    case = random_case(8, ("none", "all", "none"), size=(6, 9))
+    for confidence in (0.0, 0.7):
+        _, metrics = zero_stereo_loss(**{**case, "confidence": torch.full_like(case["confidence"], confidence)}, photometric="ordinary")
+        maps = [
+            oracles_loss.photometric_loss(left.double().numpy() / 255, right.double().numpy() / 255, prediction.detach().numpy(), 0.85)
+            for left, right, prediction in zip(case["left_clean"], case["right_clean"], case["predictions"][-1][:, 0], strict=True)
+        ]
+        assert metrics["photometric_term"].item() == pytest.approx(0.1 * np.mean(maps), rel=1e-4)
+
+
+@pytest.mark.parametrize("photometric", ["nonocclusion", "ordinary"])
+def test_two_ranks_together_have_the_loss_of_their_pairs_in_one_batch(photometric):
+    case = random_case(13, batch=4, size=(8, 9))
+    case["masks"].valid[:2] = False  # one rank has nothing to supervise
+    options = {"photometric": photometric, "max_disparity": 5.0}
+
+    def gradient_and_values(batch: dict, **more):
+        for prediction in batch["predictions"]:
+            prediction.grad = None
+        loss, metrics = zero_stereo_loss(**batch, **options, **more)
+        loss.backward()
+        return torch.stack([prediction.grad for prediction in batch["predictions"]]), {"loss": loss.detach(), **metrics}
+
+    def rank(first: int) -> dict:
+        return {
+            "predictions": [prediction.detach()[first : first + 2].requires_grad_() for prediction in case["predictions"]],
+            "masks": Masks(*(mask[first : first + 2] for mask in case["masks"])),
+            "initial_prediction": case["initial_prediction"].detach()[first : first + 2],
+            **{name: case[name][first : first + 2] for name in ("left_clean", "right_clean", "disparity", "confidence")},
+        }
+
+    counts = []
+    for first in (0, 2):
+        zero_stereo_loss(**rank(first), **options, mean_over_ranks=lambda values: counts.append(values) or values)
+    shared = torch.stack(counts).mean(0)
+    ranks = [gradient_and_values(rank(first), mean_over_ranks=lambda values: shared) for first in (0, 2)]
+    gradients, whole = gradient_and_values(case)
+    torch.testing.assert_close(torch.cat([gradient for gradient, _ in ranks], dim=1) / 2, gradients, atol=1e-7, rtol=1e-5)
+    for name, value in whole.items():
+        torch.testing.assert_close((ranks[0][1][name] + ranks[1][1][name]) / 2, value)
 
 
 def test_half_precision_predictions_are_judged_in_full_precision():
@@ -223,6 +334,7 @@ def test_arguments_are_left_as_they_were():
         (lambda case: case.update(gamma=0.0), "gamma"),
         (lambda case: case.update(mu=-1.0), "mu"),
         (lambda case: case.update(beta=1.5), "beta"),
+        (lambda case: case.update(photometric="none"), "nonocclusion, ordinary; got 'none'"),
     ],
 )
 def test_what_does_not_fit_is_named(change, message):
