@@ -9,8 +9,9 @@ Two facts make this one scatter per row. Among the sources that land on one u, t
 d = x - u; so the z-buffer is `amax` of the source's position. And with d = n + f (n whole, 0 <= f < 1; both exact in floating point) the
 first column at or right of x' is x - n, so that every comparison is between disparities, never between rounded positions.
 
-Fast, because nearly all of a photo is the inside of surfaces: there a pixel and its right neighbour span what lands between them, with no
-case to tell apart. Everything is computed as if it were the inside; the few pixels at tears are done again, as lists.
+Fast, because nearly every pixel, with its right neighbour, covers just the first column at or right of x'. What that column would show is
+computed for every left pixel, without a look-up; then each right pixel takes it from its winner. The few that are covered otherwise, at the
+ends of surfaces and where they stretch, are done again as a list.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from zsdata.synthesis.indices import flat_indices
@@ -28,7 +30,7 @@ CACHED_PX = 65_536  # warped at once on the CPU: what is between the steps stays
 # (0.92 of its gradient energy against 0.72), so that blur does not tell the fraction of a disparity. See benchmarks/reprojection.py.
 SHARPNESS = 1.0
 LARGEST_STEP_PX = 1.0  # neighbours whose disparities differ by more are two surfaces
-PAD = 4  # zeros before and after the pixels of a plane: a hole reads the first ones
+SMALLEST_STRETCH = 1e-6  # px of the right view that a left pixel is stretched to; less is hidden by its neighbour
 FAR_AWAY_PX = 1e9  # the disparity of a hole where it is compared with a pixel's own
 
 
@@ -78,17 +80,16 @@ def forward_warp(left: Tensor, disparity: Tensor) -> Warped:
     for top in range(0, height, rows):
         band = slice(top, top + rows)
         shape = disparity[:, 0, band].shape
-        plane = _padded(disparity[:, 0, band])
-        torn = _torn(plane, grid)
-        spans = _spans(plane, _nearest(plane, torn, grid), grid)
-        covered = spans.covered.to(left.dtype)
-        for channel, colour in enumerate(_colours(left[:, :, band], spans, torn)):
+        surface = _surface(disparity[:, 0, band])
+        shown = _shown(surface, grid)
+        covered = shown.covered.to(left.dtype)
+        for channel, colour in enumerate(_colours(left[:, :, band], surface, shown)):
             for image, limit in enumerate(limits):
                 colour.view(shape)[image].clamp_(*limit)
             right[:, channel, band] = colour.mul_(covered).view(shape)
-        right_disparity[:, 0, band] = spans.disparity.view(shape)
-        hole[:, 0, band] = (1 - spans.covered).bool().view(shape)
-        seen[:, 0, band] = _wins_where_it_lands(plane, spans, grid).view(shape)
+        right_disparity[:, 0, band] = shown.disparity.view(shape)
+        hole[:, 0, band] = (1 - shown.covered).bool().view(shape)
+        seen[:, 0, band] = _wins_where_it_lands(surface, shown, grid).view(shape)
     return Warped(right, hole, seen, right_disparity)
 
 
@@ -111,7 +112,7 @@ class _Grid(NamedTuple):
 
     Attributes:
         column: of each pixel.
-        place: of each pixel in a padded plane, less one, so that a hole's 0 and its neighbours read zeros.
+        place: of each pixel, from 0 on.
         target: its own column, in rows that have `margin` columns more on the left, where what leaves the frame lands.
     """
 
@@ -124,47 +125,103 @@ class _Grid(NamedTuple):
     @staticmethod
     def make(rows: int, width: int, margin: int, device: torch.device) -> _Grid:
         column = torch.arange(width, device=device, dtype=torch.int32).repeat(rows)
-        place = torch.arange(PAD - 1, PAD - 1 + rows * width, device=device, dtype=torch.int32)
+        place = torch.arange(rows * width, device=device, dtype=torch.int32)
         target = torch.arange(rows * (margin + width), device=device, dtype=torch.int32).view(rows, -1)[:, margin:].reshape(-1)
         return _Grid(width, margin, column, place, target)
 
 
-def _padded(band: Tensor) -> Tensor:
-    """Its pixels row by row, between PAD zeros."""
-    plane = band.new_zeros(band.numel() + 2 * PAD)
-    plane[PAD:-PAD].view(band.shape).copy_(band)
-    return plane
+class _Surface(NamedTuple):
+    """The surfaces that a band's pixels lie on. Flat [N], row by row.
 
-
-def _torn(plane: Tensor, grid: _Grid) -> Tensor:
-    """Indices of the pixels whose right neighbour belongs to another surface; the last column's always does."""
-    torn = (plane[PAD + 1 : -PAD + 1] - plane[PAD:-PAD]).abs_() > LARGEST_STEP_PX
-    torn.view(-1, grid.width)[:, -1] = True
-    return flat_indices(torn)
-
-
-def _nearest(plane: Tensor, torn: Tensor, grid: _Grid) -> Tensor:
-    """The z-buffer: int32 [N], right frame: 2 * place of the winning pixel, + 1 where it wins alone, not as a span; 0 in holes.
-
-    A span is a pixel and its right neighbour on one surface: it covers the columns of [x'(i), x'(i + 1)), two at most. At the ends of a
-    surface a pixel covers half a pixel more.
+    Attributes:
+        disparity: float32, px.
+        following: float32, px, the right neighbour's disparity; the last column's is anything.
+        whole: float32, the disparity rounded down: x - whole is the first column at or right of x'.
+        torn: int64, indices of the pixels whose right neighbour lies on another surface; the last column's always does.
+        share: float32, how far from the pixel (0) to its right neighbour (1) the point lies that lands on column x - whole.
     """
-    disparity, following = plane[PAD:-PAD], plane[PAD + 1 : -PAD + 1]
+
+    disparity: Tensor
+    following: Tensor
+    whole: Tensor
+    torn: Tensor
+    share: Tensor
+
+
+def _surface(band: Tensor) -> _Surface:
+    padded = F.pad(band.reshape(-1), (0, 1))
+    disparity, following = padded[:-1], padded[1:]
+    torn = (following - disparity).abs_() > LARGEST_STEP_PX
+    torn.view(-1, band.shape[-1])[:, -1] = True
+    torn = flat_indices(torn)
+    whole = disparity.floor()
+    share = _share_at(disparity - whole, disparity, following)
+    share[torn] = 0
+    return _Surface(disparity, following, whole, torn, share)
+
+
+def _share_at(distance: Tensor, disparity: Tensor, following: Tensor) -> Tensor:
+    """How far from the pixel to its right neighbour the point lies that lands `distance` px right of x'; 0 if that is negative."""
+    stretch = (disparity - following).add_(1).clamp_(min=SMALLEST_STRETCH)  # x'(i + 1) - x'(i)
+    return (distance / stretch).clamp_(0, 1)
+
+
+class _Shown(NamedTuple):
+    """What each right pixel shows. Flat [N].
+
+    Attributes:
+        source: int64, index of the left pixel whose point it is, or which that point lies right of; anything in holes.
+        covered: float32, 0 in holes, 1 elsewhere.
+        disparity: float32, px; 0 in holes.
+        special: int64, indices of the right pixels that are not at column x - whole of their source.
+        special_share: float32, of these, how far from the source to its right neighbour the point lies.
+    """
+
+    source: Tensor
+    covered: Tensor
+    disparity: Tensor
+    special: Tensor
+    special_share: Tensor
+
+
+def _shown(surface: _Surface, grid: _Grid) -> _Shown:
+    nearest = _nearest(surface, grid)
+    special = flat_indices((nearest & 1).bool())
+    covered = nearest.clamp(max=1).float()
+    place = ((nearest >> 1) - 1).clamp_(min=0)
+    source = place.long()
+
+    there = source[special]
+    disparity, following = surface.disparity[there], surface.following[there]
+    distance = (grid.place[special] - place[special]).float() + disparity  # u - x'
+    special_share = _share_at(distance, disparity, following)
+
+    right_disparity = torch.lerp(surface.disparity, surface.following, surface.share).index_select(0, source)
+    right_disparity[special] = torch.lerp(disparity, following, special_share)
+    return _Shown(source, covered, right_disparity.mul_(covered), special, special_share)
+
+
+def _nearest(surface: _Surface, grid: _Grid) -> Tensor:
+    """The z-buffer: int32 [N], right frame: 2 * (place of the winning pixel + 1), + 1 where it is not at its column x - whole; 0 in holes.
+
+    A pixel and its right neighbour on the same surface cover the columns of [x'(i), x'(i + 1)), two at most. At the ends of a surface a
+    pixel covers half a pixel more.
+    """
+    disparity, following, whole, torn, _ = surface
     count = len(disparity)
     rows = count // grid.width
-    whole = disparity.floor()
-    column = grid.target[:count] - whole.int()  # the first column at or right of x'
+    column = grid.target[:count] - whole.int()
+    key = (grid.place[:count] + 1) << 1
 
-    key = grid.place[:count] << 1
-    span = key * (whole + 1).gt_(following).int()
-    span[torn] = (key[torn] + 1) * (disparity[torn] - whole[torn] <= 0.5)
-    buffer = torch.zeros(rows * (grid.width + grid.margin), dtype=torch.int32, device=plane.device)
-    buffer.scatter_reduce_(0, column.long(), span, "amax")
+    covers = (whole + 1).gt_(following)
+    covers[torn] = (disparity[torn] - whole[torn]).le_(0.5)
+    buffer = torch.zeros(rows * (grid.width + grid.margin), dtype=torch.int32, device=disparity.device)
+    buffer.scatter_reduce_(0, column.long(), key * covers.int(), "amax")
 
     covers_next = following < whole
     covers_next[torn] = False
     wide = flat_indices(covers_next)
-    buffer.scatter_reduce_(0, column[wide].long() + 1, key[wide], "amax")
+    buffer.scatter_reduce_(0, column[wide].long() + 1, key[wide] + 1, "amax")
 
     first = torch.cat([torn.new_zeros(1), torn[:-1] + 1])  # pixels of the surfaces
     first = first[disparity[first] - whole[first] >= 0.5]
@@ -172,63 +229,46 @@ def _nearest(plane: Tensor, torn: Tensor, grid: _Grid) -> Tensor:
     return buffer.view(rows, -1)[:, grid.margin :].reshape(-1)
 
 
-class _Spans(NamedTuple):
-    """For each right pixel the span that it shows, and where in it. Flat [N].
-
-    Attributes:
-        first: int64, place of the span's first pixel; 0 in holes.
-        share: float32, 0 at the first pixel, 1 at the second one.
-        covered: float32, 0 in holes, 1 elsewhere.
-        disparity: float32, px; 0 in holes.
-    """
-
-    first: Tensor
-    share: Tensor
-    covered: Tensor
-    disparity: Tensor
-
-
-def _spans(plane: Tensor, nearest: Tensor, grid: _Grid) -> _Spans:
-    """The point of the nearest surface that lands on each right pixel's centre."""
-    first = nearest >> 1
-    alone = flat_indices((nearest & 1).bool())
-    covered = first.clamp(max=1).float()
-    behind = (grid.place[: len(nearest)] - first).float()  # u - i
-    first = first.long()
-    here, there = (plane[tap:].index_select(0, first) for tap in (1, 2))
-    there[alone] = here[alone]
-    share = behind.add_(here).div_((here - there).add_(1))  # u - x'(i), over x'(i + 1) - x'(i)
-    share[alone] = 0
-    return _Spans(first, share, covered, torch.lerp(here, there, share))
-
-
-def _colours(left: Tensor, spans: _Spans, torn: Tensor) -> Iterator[Tensor]:
-    """`left` [B, C, rows, W] at the spans' points; [N] for each channel, anything in holes.
+def _colours(left: Tensor, surface: _Surface, shown: _Shown) -> Iterator[Tensor]:
+    """`left` [B, C, rows, W] at the points that are shown; [N] for each channel, anything in holes.
 
     With t the share and p'' the second difference p(i - 1) - 2 p(i) + p(i + 1):
     lerp(p(i), p(i + 1), t) - SHARPNESS t (1 - t) lerp(p''(i), p''(i + 1), t).
     Where a surface ends p'' is zero: there its colour goes on straight, and nothing of the other side comes in.
     """
-    inside = left.new_ones(spans.first.numel() + 2 * PAD - 2)
-    inside[:PAD] = 0
-    inside[-PAD + 1 :] = 0
-    inside[torn + (PAD - 1)] = 0
-    inside[torn + PAD] = 0
-    share = spans.share.to(left.dtype)
-    bend = SHARPNESS * share * (share - 1)
-
-    def between(plane: Tensor) -> Tensor:
-        return torch.lerp(plane.index_select(0, spans.first), plane[1:].index_select(0, spans.first), share)
-
+    inside = left.new_ones(len(shown.source) + 1)
+    inside[0] = 0
+    inside[surface.torn] = 0
+    inside[surface.torn + 1] = 0
+    curve, special_curve = (_Cubic.at(share.to(left.dtype)) for share in (surface.share, shown.special_share))
+    there = shown.source[shown.special]
     for channel in range(left.shape[1]):
-        plane = _padded(left[:, channel])
-        second = (plane[:-2] + plane[2:]).sub_(plane[1:-1], alpha=2).mul_(inside)
-        yield between(plane[1:]).addcmul_(bend, between(second))
+        padded = F.pad(left[:, channel].reshape(-1), (1, 2))
+        second = (padded[:-2] + padded[2:]).sub_(padded[1:-1], alpha=2).mul_(inside)
+        here, following = padded[1:-2], padded[2:-1]
+        taps = here, following, second[:-1], second[1:]
+        colour = curve(*taps).index_select(0, shown.source)
+        yield colour.index_copy_(0, shown.special, special_curve(*(values.index_select(0, there) for values in taps)))
 
 
-def _wins_where_it_lands(plane: Tensor, spans: _Spans, grid: _Grid) -> Tensor:
+class _Cubic(NamedTuple):
+    """The cubic of `_colours` at given shares."""
+
+    share: Tensor
+    bend: Tensor
+
+    @staticmethod
+    def at(share: Tensor) -> _Cubic:
+        return _Cubic(share, (share - 1).mul_(share).mul_(SHARPNESS))
+
+    def __call__(self, here: Tensor, following: Tensor, second_here: Tensor, second_following: Tensor) -> Tensor:
+        second = torch.lerp(second_here, second_following, self.share)
+        return torch.lerp(here, following, self.share).addcmul_(self.bend, second)
+
+
+def _wins_where_it_lands(surface: _Surface, shown: _Shown, grid: _Grid) -> Tensor:
     """bool [N]: True where round(x') lies in the image and the surface seen there is the pixel's own (disparity within 1 px)."""
-    disparity = plane[PAD:-PAD]
+    disparity = surface.disparity
     count = len(disparity)
     rows = count // grid.width
     ahead = disparity - 0.5
@@ -238,7 +278,7 @@ def _wins_where_it_lands(plane: Tensor, spans: _Spans, grid: _Grid) -> Tensor:
     steps += half_way & (grid.column[:count] - steps)  # unless it is odd: torch.round takes the even one
     landing = grid.target[:count] - steps
 
-    shown = torch.full((rows, grid.width + grid.margin), FAR_AWAY_PX, dtype=disparity.dtype, device=disparity.device)
-    shown[:, grid.margin :] = torch.add(spans.disparity, 1 - spans.covered, alpha=FAR_AWAY_PX).view(rows, -1)
-    there = shown.view(-1).index_select(0, landing.long())
+    seen = torch.full((rows, grid.width + grid.margin), FAR_AWAY_PX, dtype=disparity.dtype, device=disparity.device)
+    seen[:, grid.margin :] = torch.add(shown.disparity, 1 - shown.covered, alpha=FAR_AWAY_PX).view(rows, -1)
+    there = seen.view(-1).index_select(0, landing.long())
     return (there - disparity).abs_() <= LARGEST_STEP_PX
