@@ -111,7 +111,7 @@ def photo_members(file: ShardFile, on_problem: Callable[[Problem], None], *, str
             continue
         refused.add(key)
         on_problem(Problem(file.url, key, member.offset, reason))
-    if last is not None and last.size and _ends_in_zeros(file, last):
+    if last is not None and _ends_in_zeros(file, last):
         end = last.offset + last.size
         fault = BadShard(f'zeros from inside "{last.key}" to the end: more may be missing; download it again', file.url, end)
         if strict:
@@ -123,8 +123,7 @@ def photo_members(file: ShardFile, on_problem: Callable[[Problem], None], *, str
 
 def _ends_in_zeros(file: ShardFile, photo: PhotoMember) -> bool:
     """No JPEG, PNG or WebP does."""
-    size = min(photo.size, 64)
-    return not file.read_at(photo.offset + photo.size - size, size).strip(b"\0")
+    return photo.size >= 64 and not file.read_at(photo.offset + photo.size - 64, 64).strip(b"\0")
 
 
 class _Beside(NamedTuple):

@@ -23,6 +23,7 @@ from zsdata.source.urls import base_name, expand_urls, local_path
 VERSION = 1
 MAX_INDEX_BYTES = 1 << 28  # 256 MiB; a photo takes about 50 bytes
 CHECKSUM_UNKNOWN = -1
+CHANGED_BYTES = "damaged: other bytes than when the shard was indexed"
 REMOTE_AT_ONCE = 16  # shards asked for their state at the same time
 _REMOTE_STAMPS = ("ETag", "etag", "Content-MD5", "md5Hash", "Last-Modified", "LastModified", "updated", "blob_id", "mtime", "created")
 

@@ -18,14 +18,12 @@ from tqdm import tqdm
 
 from zsdata.faults import BadPhoto
 from zsdata.source.archive import Problem, header_inside
-from zsdata.source.index import CHECKSUM_UNKNOWN, load_or_list
+from zsdata.source.index import CHANGED_BYTES, CHECKSUM_UNKNOWN, load_or_list
 from zsdata.source.ranges import ShardFile, read_range
 from zsdata.source.tar import walk_tar
 from zsdata.source.urls import base_name, expand_urls
 
 logger = logging.getLogger("zsdata")
-
-CHANGED_BYTES = "damaged: other bytes than when the shard was indexed"
 
 
 class Member(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -10,6 +11,7 @@ from tqdm import tqdm
 
 from zsdata.faults import BadPhoto
 from zsdata.source.archive import Problem, photo_members
+from zsdata.source.index import CHANGED_BYTES, StaleIndex, load_listing
 from zsdata.source.photo import decode_rgb
 from zsdata.source.ranges import ShardFile
 from zsdata.source.urls import base_name, expand_urls
@@ -22,6 +24,7 @@ class VerifyReport:
     shards: int = 0
     photos: int = 0  # those that decode
     bytes: int = 0  # of the shards
+    indexed: int = 0  # shards whose photos were held against the checksums of their index
     problems: list[Problem] = field(default_factory=list)
 
 
@@ -34,7 +37,8 @@ def verify(
 ) -> VerifyReport:
     """Reads all of a source: the headers of its shards, and each photo down to its pixels. Nothing is written.
 
-    A shard that cannot be read, or holds no photo at all, is a problem of that shard; the others are still looked at.
+    A shard that cannot be read, or holds no photo at all, is a problem of that shard; the others are still looked at. Where a shard has an
+    index (`write_index`), each photo must have the bytes that it had then, and none may be missing.
 
     Args:
         urls: as `expand_urls` takes them.
@@ -61,19 +65,51 @@ def verify(
             try:
                 with ShardFile(url) as file:
                     report.bytes += file.size
+                    indexed = _Indexed(url, add)
+                    report.indexed += indexed.found
                     for key, offset, size in photo_members(file, add):
-                        reason = _reason_against(file.read_at(offset, size), shortest_side_px)
+                        data = file.read_at(offset, size)
+                        reason = _reason_against(data, shortest_side_px) or indexed.reason_against(key, data)
                         if reason is None:
                             report.photos += 1
                         else:
                             add(Problem(url, key, offset, reason))
                         bar.update()
+                    indexed.report_missing()
             except OSError as error:
                 add(Problem(url, None, 0, f"cannot be read: {error.strerror or error}"))
             if report.photos + len(report.problems) == before:
                 add(Problem(url, None, 0, "no JPEG, PNG or WebP in it"))
             report.shards += 1
     return report
+
+
+class _Indexed:
+    """What the index of a shard knows of its photos; nothing without an index."""
+
+    def __init__(self, url: str, add: Callable[[Problem], None]) -> None:
+        self._url, self._add = url, add
+        try:
+            listing = load_listing(url, even_if_touched=True)  # a copy has another time and must have the same bytes
+        except StaleIndex as stale:
+            add(Problem(url, None, 0, f"index not usable: {stale}; zsdata index renews it"))
+            listing = None
+        self.found = listing is not None
+        self._checksums = {} if listing is None else dict(zip(listing.keys, listing.checksums, strict=True))
+        self._offsets = {} if listing is None else dict(zip(listing.keys, listing.offsets, strict=True))
+
+    def reason_against(self, key: str, data: bytes) -> str | None:
+        if not self.found:
+            return None
+        self._offsets.pop(key, None)
+        checksum = self._checksums.get(key)
+        if checksum is None:
+            return "not in the index of its shard"
+        return None if zlib.crc32(data) == checksum else CHANGED_BYTES
+
+    def report_missing(self) -> None:
+        for key, offset in self._offsets.items():
+            self._add(Problem(self._url, key, offset, "lost: it was there when the shard was indexed"))
 
 
 def _reason_against(data: bytes, shortest_side_px: int) -> str | None:
