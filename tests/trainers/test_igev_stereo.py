@@ -228,7 +228,7 @@ def test_mixed_precision_matches_and_predicts_in_float32(published, monkeypatch)
         return lambda disparity: seen.append((disparity.dtype, lookup(disparity).dtype)) or lookup(disparity)
 
     monkeypatch.setattr(module, "groupwise_correlation", correlate)
-    monkeypatch.setattr(module, "geometry_encoding", encode)
+    monkeypatch.setattr(matcher, "encode_geometry", encode)
     with torch.no_grad(), torch.autocast("cpu", dtype=torch.bfloat16):
         initial, sequence = matcher(images["left"], images["right"], iterations=2)
     assert len(seen) == 4 and {dtype for dtypes in seen for dtype in dtypes} == {torch.float32}

@@ -1,12 +1,12 @@
 """How well each left pixel matches the right pixels of its row, looked up around the current estimate.
 
 Level l of the pyramid averages 2^l neighbouring right pixels. Both forms give the same numbers: the pyramid computes every correlation
-once and keeps H W^2 of them, on-demand keeps none and computes the few that a lookup asks for, each time.
+once and keeps H W^2 of them; on-demand keeps none and computes them again for each lookup, a few rows at a time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import cast
 
 import torch
@@ -16,52 +16,50 @@ from torch.utils.checkpoint import checkpoint
 
 Lookup = Callable[[Tensor], Tensor]
 
+ROWS_AT_ONCE_VALUES = 2**24  # correlations on demand: 64 MiB in float32, enough to keep a GPU busy
 
-def correlation_pyramid(left: Tensor, right: Tensor, levels: int, radius: int) -> Lookup:
+
+def look_up(volumes: Sequence[Tensor], x: Tensor, radius: int) -> Tensor:
+    """Correlations around columns x [B, 1, H, W], as `correlation_pyramid` says; volume l is [B, H, W, columns / 2^l]."""
+    x = x[:, 0]
+    found = [interpolate(volume, x / 2**level, radius) for level, volume in enumerate(volumes)]
+    return torch.cat(found, dim=-1).permute(0, 3, 1, 2)
+
+
+def correlation_pyramid(
+    left: Tensor, right: Tensor, levels: int, radius: int, look_up: Callable[[Sequence[Tensor], Tensor, int], Tensor] = look_up
+) -> Lookup:
     """Correlates the features [B, C, H, W] of both views.
 
     Returns:
         A function from columns x [B, 1, H, W] of the right features to correlations [B, levels * (2 radius + 1), H, W]: level by
         level, offset by offset from -radius to radius; 0 beside the image.
     """
-    volume = torch.einsum("bchx,bchy->bhxy", left, right) / left.shape[1] ** 0.5
-    pyramid = [volume]
+    volumes = [correlate_rows(left, right)]
     for _ in range(levels - 1):
-        pyramid.append(F.avg_pool2d(pyramid[-1], (1, 2)))
-
-    def lookup(x: Tensor) -> Tensor:
-        x = x[:, 0]
-        found = [interpolate(level, x / 2**i, radius) for i, level in enumerate(pyramid)]
-        return torch.cat(found, dim=-1).permute(0, 3, 1, 2)
-
-    return lookup
+        volumes.append(F.avg_pool2d(volumes[-1], (1, 2)))
+    return lambda x: look_up(volumes, x, radius)
 
 
 def correlation_on_demand(left: Tensor, right: Tensor, levels: int, radius: int) -> Lookup:
     """As `correlation_pyramid`, in memory that grows with H W instead of H W^2, in the backward pass too."""
-    pyramid = [right]
-    for _ in range(levels - 1):
-        pyramid.append(F.avg_pool2d(pyramid[-1], (1, 2)))
+    rows = max(1, ROWS_AT_ONCE_VALUES // (left.shape[0] * left.shape[-1] * right.shape[-1]))
 
-    def correlate(x: Tensor) -> Tensor:
-        found = []
-        for i, features in enumerate(pyramid):
-            columns, weight = neighbours((x / 2**i)[:, 0], radius)
-            width = features.shape[-1]
-            dots = []
-            for column in columns.unbind(-1):
-                index = column.clamp(0, width - 1)[:, None].expand_as(left)
-                dot = (left * features.gather(3, index)).sum(1) / left.shape[1] ** 0.5
-                dots.append(torch.where((column >= 0) & (column < width), dot, 0.0))
-            values = torch.stack(dots, dim=1)
-            found.append(torch.lerp(values[:, :-1], values[:, 1:], weight[:, None]))
-        return torch.cat(found, dim=1)
+    def look_up_rows(left: Tensor, right: Tensor, x: Tensor) -> Tensor:
+        return correlation_pyramid(left, right, levels, radius)(x)
 
-    def lookup(x: Tensor) -> Tensor:
-        # Without the checkpoint the backward pass would hold the gathered features of every offset, far more than the volume.
-        return cast(Tensor, checkpoint(correlate, x, use_reentrant=False, preserve_rng_state=False))
+    def look_up_all(x: Tensor) -> Tensor:
+        parts = zip(left.split(rows, dim=2), right.split(rows, dim=2), x.split(rows, dim=2), strict=True)
+        # Without the checkpoint the backward pass would hold all correlations.
+        found = [checkpoint(look_up_rows, *part, use_reentrant=False, preserve_rng_state=False) for part in parts]
+        return torch.cat(cast(list[Tensor], found), dim=2)
 
-    return lookup
+    return look_up_all
+
+
+def correlate_rows(left: Tensor, right: Tensor) -> Tensor:
+    """Scalar products of each left pixel with all right pixels of its row: [B, C, H, W] and [B, C, H, N] to [B, H, W, N]."""
+    return torch.einsum("bchx,bchy->bhxy", left, right) / left.shape[1] ** 0.5
 
 
 def interpolate(volume: Tensor, x: Tensor, radius: int) -> Tensor:

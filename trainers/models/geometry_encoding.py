@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -9,7 +11,28 @@ from torch import Tensor
 from trainers.models.correlation import Lookup, interpolate
 
 
-def geometry_encoding(volume: Tensor, left: Tensor, right: Tensor, levels: int, radius: int) -> Lookup:
+def look_up(pyramid: Sequence[tuple[Tensor, Tensor]], disparity: Tensor, radius: int) -> Tensor:
+    """Both kinds of values around disparities [B, 1, H, W], as `geometry_encoding` says.
+
+    Level l of the pyramid is [B, H, W, C, D / 2^l] of the volume and [B, H, W, 1, W / 2^l] of the correlation.
+    """
+    disparity = disparity[:, 0, :, :, None]  # [B, H, W, 1], shared by the channels
+    columns = torch.arange(disparity.shape[2], device=disparity.device, dtype=disparity.dtype)[:, None]
+    found = []
+    for level, (geometry, correlation) in enumerate(pyramid):
+        found.append(interpolate(geometry, disparity / 2**level, radius))
+        found.append(interpolate(correlation, (columns - disparity) / 2**level, radius))
+    return torch.cat([values.flatten(3) for values in found], dim=-1).permute(0, 3, 1, 2).contiguous()
+
+
+def geometry_encoding(
+    volume: Tensor,
+    left: Tensor,
+    right: Tensor,
+    levels: int,
+    radius: int,
+    look_up: Callable[[Sequence[tuple[Tensor, Tensor]], Tensor, int], Tensor] = look_up,
+) -> Lookup:
     """Combines two pyramids: level l averages 2^l neighbouring disparities of the volume, and 2^l right columns of the correlation.
 
     Args:
@@ -27,17 +50,7 @@ def geometry_encoding(volume: Tensor, left: Tensor, right: Tensor, levels: int, 
     for _ in range(levels - 1):
         geometry, correlation = halve_last(geometry), halve_last(correlation)
         pyramid.append((geometry, correlation))
-    columns = torch.arange(left.shape[-1], device=left.device, dtype=left.dtype)[:, None]
-
-    def lookup(disparity: Tensor) -> Tensor:
-        disparity = disparity[:, 0, :, :, None]  # [B, H, W, 1], shared by the channels
-        found = []
-        for i, (geometry, correlation) in enumerate(pyramid):
-            found.append(interpolate(geometry, disparity / 2**i, radius))
-            found.append(interpolate(correlation, (columns - disparity) / 2**i, radius))
-        return torch.cat([values.flatten(3) for values in found], dim=-1).permute(0, 3, 1, 2).contiguous()
-
-    return lookup
+    return lambda disparity: look_up(pyramid, disparity, radius)
 
 
 def halve_last(x: Tensor) -> Tensor:

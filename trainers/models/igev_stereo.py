@@ -6,15 +6,17 @@ Options, parameter names and numbers are those of the published code, so that it
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from trainers.models import geometry_encoding
 from trainers.models.conv_blocks import JoinFiner, conv_2d, conv_3d
 from trainers.models.cost_volume import DISPARITY_MULTIPLE_PX, FeatureAttention, Hourglass, expected_disparity, groupwise_correlation
 from trainers.models.extractor import ContextEncoder
-from trainers.models.geometry_encoding import geometry_encoding
 from trainers.models.igev_update import UPSAMPLING_CHANNELS, IGEVUpdateBlock
 from trainers.models.matcher import Matcher, check_padded
 from trainers.models.mobilenet import CHANNELS, MobileNetV2
@@ -59,6 +61,8 @@ class IGEVStereo(Matcher):
         slow_fast_gru: the coarse GRUs are updated more often than the fine one.
     """
 
+    PARTS = ("_encode", "_regress", "_upsample_initial", "_context", "_update", "_upsample")
+
     def __init__(
         self,
         hidden_dims: Sequence[int] = (128, 128, 128),
@@ -86,6 +90,7 @@ class IGEVStereo(Matcher):
         coarse, middle, fine = hidden_dims
         self.corr_levels, self.corr_radius = corr_levels, corr_radius
         self.n_gru_layers, self.slow_fast_gru = n_gru_layers, slow_fast_gru
+        self.encode_geometry = geometry_encoding.geometry_encoding
 
         self.cnet = ContextEncoder("batch", n_downsample, (coarse, middle, fine), names=("outputs04", "outputs08", "outputs16"))
         geometry_channels = corr_levels * (2 * corr_radius + 1) * (GROUPS + 1)
@@ -133,37 +138,26 @@ class IGEVStereo(Matcher):
             raise ValueError(f"iterations is at least 1; got {iterations}")
         left, right = 2 * (left / 255) - 1, 2 * (right / 255) - 1
         half_resolution, features, left_matching, right_matching = self._encode(left, right)
+        volume, disparity = self._regress(features, left_matching, right_matching)
         full_precision = torch.autocast(left.device.type, enabled=False)  # correlations and disparities overflow or lose steps in half
         with full_precision:
-            volume = groupwise_correlation(left_matching.float(), right_matching.float(), self.disparities, GROUPS)
-        volume = self.corr_feature_att(self.corr_stem(volume), features[0])
-        volume = self.cost_agg(volume, features[1:])
-        scores = self.classifier(volume)[:, 0]
-        with full_precision:
-            lookup = geometry_encoding(volume.float(), left_matching.float(), right_matching.float(), self.corr_levels, self.corr_radius)
-            disparity = expected_disparity(scores.float())
-        initial = None
-        if every_iteration:
-            weights = self.spx(self.spx_2(self.spx_4(features[0]), half_resolution))
-            initial = upsample(disparity, weights)
-
-        outputs = self.cnet.heads(self.cnet(left), self.n_gru_layers)
-        hidden = [torch.tanh(output[0]) for output in outputs]
-        context = [conv(torch.relu(output[1])).chunk(3, dim=1) for output, conv in zip(outputs, self.context_zqr_convs, strict=True)]
+            lookup = self.encode_geometry(volume.float(), left_matching.float(), right_matching.float(), self.corr_levels, self.corr_radius)
+        initial = self._upsample_initial(disparity, features[0], half_resolution) if every_iteration else None
+        hidden, context = self._context(left)
         sequence = []
         for i in range(iterations):
             disparity = disparity.detach()
             with full_precision:
                 geometry = lookup(disparity)
-            if self.slow_fast_gru:
-                for finest in range(self.n_gru_layers - 1, 0, -1):
-                    hidden = self.update_block.update_coarse(hidden, context, finest)
-            hidden, step = self.update_block(hidden, context, geometry, disparity)
-            disparity = disparity + step.float()
+            hidden, disparity = self._update(hidden, context, geometry, disparity)
             if every_iteration or i == iterations - 1:
-                features_4 = self.update_block.upsampling_features(hidden[0])
-                sequence.append(upsample(disparity, self.spx_gru(self.spx_2_gru(features_4, half_resolution))))
+                sequence.append(self._upsample(disparity, hidden[0], half_resolution))
         return initial, sequence
+
+    def compile_parts(self, **options: Any) -> None:
+        super().compile_parts(**options)
+        look_up = torch.compile(geometry_encoding.look_up, fullgraph=True, dynamic=False, **options)
+        self.encode_geometry = partial(geometry_encoding.geometry_encoding, look_up=look_up)
 
     def _encode(self, left: Tensor, right: Tensor) -> tuple[Tensor, list[Tensor], Tensor, Tensor]:
         """Of the left view, features at 1/2 and at 1/4, 1/8, 1/16 and 1/32; of both views, those to match, at 1/4. Images in -1..1."""
@@ -174,6 +168,42 @@ class IGEVStereo(Matcher):
         left_matching, right_matching = self.desc(self.conv(quarter)).chunk(2)
         features = [level.chunk(2)[0] for level in (quarter, *coarser)]
         return half_resolution.chunk(2)[0], features, left_matching, right_matching
+
+    def _regress(self, features: list[Tensor], left_matching: Tensor, right_matching: Tensor) -> tuple[Tensor, Tensor]:
+        """The geometry encoding volume, and the disparity [B, 1, h, w] in it."""
+        with torch.autocast(left_matching.device.type, enabled=False):
+            volume = groupwise_correlation(left_matching.float(), right_matching.float(), self.disparities, GROUPS)
+        volume = self.corr_feature_att(self.corr_stem(volume), features[0])
+        volume = self.cost_agg(volume, features[1:])
+        scores = self.classifier(volume)[:, 0]
+        with torch.autocast(scores.device.type, enabled=False):
+            return volume, expected_disparity(scores.float())
+
+    def _context(self, left: Tensor) -> tuple[list[Tensor], list[tuple[Tensor, ...]]]:
+        """First hidden states and gate contexts of each GRU level."""
+        outputs = self.cnet.heads(self.cnet(left), self.n_gru_layers)
+        hidden = [torch.tanh(output[0]) for output in outputs]
+        context = [conv(torch.relu(output[1])).chunk(3, dim=1) for output, conv in zip(outputs, self.context_zqr_convs, strict=True)]
+        return hidden, context
+
+    def _update(
+        self, hidden: list[Tensor], context: list[tuple[Tensor, ...]], geometry: Tensor, disparity: Tensor
+    ) -> tuple[list[Tensor], Tensor]:
+        """Hidden states and disparity [B, 1, h, w] after one update."""
+        if self.slow_fast_gru:
+            for finest in range(self.n_gru_layers - 1, 0, -1):
+                hidden = self.update_block.update_coarse(hidden, context, finest)
+        hidden, step = self.update_block(hidden, context, geometry, disparity)
+        return hidden, disparity + step.float()
+
+    def _upsample_initial(self, disparity: Tensor, features: Tensor, half_resolution: Tensor) -> Tensor:
+        """The initial disparity at full resolution, by the image alone."""
+        return upsample(disparity, self.spx(self.spx_2(self.spx_4(features), half_resolution)))
+
+    def _upsample(self, disparity: Tensor, hidden: Tensor, half_resolution: Tensor) -> Tensor:
+        """An updated disparity at full resolution, by the hidden state."""
+        features = self.update_block.upsampling_features(hidden)
+        return upsample(disparity, self.spx_gru(self.spx_2_gru(features, half_resolution)))
 
 
 def plain_conv(channels: int) -> list[nn.Module]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -21,9 +21,30 @@ class Matcher(nn.Module):
     none. With `every_iteration=False`, `initial` is None and the sequence only its last element.
     """
 
+    PARTS: tuple[str, ...] = ()  # the functions that `compile_parts` compiles: each is called alike in every iteration and step
+
     def __init__(self) -> None:
         super().__init__()
         self.batch_norm_frozen = False
+
+    def compile_parts(self, **options: Any) -> None:
+        """Compiles the encoders and one update, not all the updates unrolled: a minute at the first step in place of many.
+
+        It is for training at one size. `predict` goes on without, as it takes images of any size.
+
+        Args:
+            options: of `torch.compile`.
+        """
+        for name in self.PARTS:
+            setattr(self, name, torch.compile(getattr(self, name), fullgraph=True, dynamic=False, **options))
+
+    def use_channels_last(self) -> None:
+        """Stores images and filters channel after channel, as tensor cores take them; the numbers change by rounding only."""
+        for module in self.modules():
+            if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d)):
+                module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+            elif isinstance(module, (nn.Conv3d, nn.ConvTranspose3d)):
+                module.to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
 
     def freeze_bn(self) -> None:
         """Keeps the running statistics of every BatchNorm2d as they are, also after a later `train()`."""
@@ -56,7 +77,8 @@ class Matcher(nn.Module):
         was_training = self.training
         self.eval()
         try:
-            _, sequence = self(*padded, iterations=iterations, every_iteration=False)
+            with torch.compiler.set_stance("force_eager"):
+                _, sequence = self(*padded, iterations=iterations, every_iteration=False)
         finally:
             self.train(was_training)
         return sequence[-1][..., above : above + height, before : before + width].float()

@@ -6,10 +6,13 @@ Options, parameter names and numbers are those of the published code, so that it
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from trainers.models import correlation
 from trainers.models.correlation import correlation_on_demand, correlation_pyramid
 from trainers.models.extractor import NORMS, TRUNK_CHANNELS, ContextEncoder, FeatureEncoder, ResidualBlock
 from trainers.models.matcher import Matcher, check_padded
@@ -31,6 +34,8 @@ class RAFTStereo(Matcher):
         slow_fast_gru: the coarse GRUs are updated more often than the fine one.
         shared_backbone: one encoder for features and context.
     """
+
+    PARTS = ("_encode", "_update", "_upsample")
 
     def __init__(
         self,
@@ -103,16 +108,32 @@ class RAFTStereo(Matcher):
             flow = flow.detach()
             with full_precision:
                 correlations = lookup(x + flow)
-            if self.slow_fast_gru:
-                for finest in range(self.n_gru_layers - 1, 0, -1):
-                    hidden = self.update_block.update_coarse(hidden, context, finest)
-            hidden, step = self.update_block(hidden, context, correlations, torch.cat([flow, torch.zeros_like(flow)], dim=1))
-            flow = flow + step[:, :1].float()
+            hidden, flow = self._update(hidden, context, correlations, flow)
             if every_iteration or i == iterations - 1:
-                weights = self.update_block.upsampling_weights(hidden[0])
-                with full_precision:
-                    sequence.append(-convex_upsample(flow, weights.float(), self.upsampling))
+                sequence.append(self._upsample(flow, hidden[0]))
         return None, sequence
+
+    def compile_parts(self, **options: Any) -> None:
+        super().compile_parts(**options)
+        if self.correlate is correlation_pyramid:
+            look_up = torch.compile(correlation.look_up, fullgraph=True, dynamic=False, **options)
+            self.correlate = partial(correlation_pyramid, look_up=look_up)
+
+    def _update(
+        self, hidden: list[Tensor], context: list[tuple[Tensor, ...]], correlations: Tensor, flow: Tensor
+    ) -> tuple[list[Tensor], Tensor]:
+        """Hidden states and flow [B, 1, h, w] after one update."""
+        if self.slow_fast_gru:
+            for finest in range(self.n_gru_layers - 1, 0, -1):
+                hidden = self.update_block.update_coarse(hidden, context, finest)
+        hidden, step = self.update_block(hidden, context, correlations, torch.cat([flow, torch.zeros_like(flow)], dim=1))
+        return hidden, flow + step[:, :1].float()
+
+    def _upsample(self, flow: Tensor, hidden: Tensor) -> Tensor:
+        """The disparity at full resolution."""
+        weights = self.update_block.upsampling_weights(hidden)
+        with torch.autocast(flow.device.type, enabled=False):
+            return -convex_upsample(flow, weights.float(), self.upsampling)
 
     def _encode(self, left: Tensor, right: Tensor) -> tuple[list[Tensor], list[tuple[Tensor, ...]], Tensor, Tensor]:
         """First hidden states and gate contexts of each GRU level, and the features of both views; images in -1..1."""
