@@ -71,7 +71,7 @@ def command(*arguments, **options):
 def test_help_explains_each_command_with_an_example(run):
     status, out, _ = run("--help")
     assert status == 0
-    for name in ("pack", "example", "verify", "preview", "export"):
+    for name in ("pack", "example", "verify", "preview", "bench", "export"):
         assert f"\n    {name} " in out
         status, of_command, _ = run(name, "--help")
         assert status == 0
@@ -80,7 +80,7 @@ def test_help_explains_each_command_with_an_example(run):
 
 
 def test_the_examples_in_the_help_are_commands_that_parse(run):
-    for name in ("pack", "example", "verify", "preview", "export"):
+    for name in ("pack", "example", "verify", "preview", "bench", "export"):
         example = run(name, "--help")[1].partition("Example: zsdata ")[2]
         assert cli._parser().parse_args(shlex.split(example)).run is not None
 

@@ -172,7 +172,19 @@ def test_stats_count_batches_and_time(tar):
         list(loader)
         stats = loader.stats()
     assert stats["batches"] == 3 and stats["pairs"] == 12 and stats["rejected"] == {}
+    assert stats["ready_batches"] == 0  # without workers nothing is made ahead
     assert {"read", "decode", "depth", "warp", "inpaint", "augment", "wait"} <= stats["seconds"].keys()
+
+
+def test_stats_say_how_many_batches_lay_ready(tar):
+    with open_stream(tar).loader(4, num_workers=2) as loader:
+        batches = iter(loader)
+        next(batches)
+        deadline = time.monotonic() + 30
+        while loader._pipeline.ready < 4 and time.monotonic() < deadline:  # two workers, two batches each
+            time.sleep(0.01)
+        next(batches)
+        assert loader.stats()["ready_batches"] >= 2  # the mean of the first time, none or more, and of this one, four
 
 
 @pytest.mark.parametrize(

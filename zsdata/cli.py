@@ -14,10 +14,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 from tqdm import tqdm
 
 import zsdata
 from zsdata.augment import AugmentConfig
+from zsdata.bench import REST, BenchReport, advice, bench, fill_depth_cache, leave_holes, samples_needed
 from zsdata.example_photos import EXAMPLE_PHOTOS, pack_example_photos
 from zsdata.export import export_pairs
 from zsdata.faults import BadShard, NoUsablePhoto, TooManyFaults
@@ -29,7 +31,7 @@ from zsdata.source.urls import expand_urls
 from zsdata.source.verify import verify
 from zsdata.stream import ZeroStereoStream
 from zsdata.synthesis.depth import load_depth
-from zsdata.synthesis.inpaint import load_inpainter
+from zsdata.synthesis.inpaint import Inpainter, load_inpainter
 from zsdata.worker import SHORTEST_SIDE_PX
 
 OK, FOUND_PROBLEMS, USER_ERROR, INTERRUPTED, PIPE_CLOSED = 0, 1, 2, 130, 141  # the last two as a shell counts signals
@@ -135,11 +137,46 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--pairs", metavar="N", type=_positive, default=6, help="how many (default: %(default)s)")
     command.add_argument("--epoch", metavar="E", type=_count, default=0, help="of the first pair (default: %(default)s)")
     command.add_argument("--first-index", metavar="I", type=_count, default=0, help="of the first pair in its epoch (default: %(default)s)")
-    command.add_argument(
-        "--size", metavar=("HEIGHT", "WIDTH"), nargs=2, type=_positive, default=(384, 512), help="of a pair in pixels (default: 384 512)"
-    )
+    _add_size(command)
     _add_steps(command)
     command.add_argument("--clean", action="store_true", help="show the pairs without their augmentation")
+
+    command = add(
+        _bench,
+        "bench",
+        "measure how fast pairs would be fed to training",
+        "Makes pairs as training would and takes the time, on this machine and from these photos. Prints where a pair's time goes, in "
+        "milliseconds and in decodes (how long OpenCV takes for the same photos, measured in between: the unit to compare machines by); "
+        "the pairs per second for several numbers of workers; and, in words, what bounds them and what to change. Every run makes the same "
+        "pairs, so after the first one the photos come from the system's memory. With nothing else on the machine, and without training "
+        "on the GPU, these are the most that training can get.",
+        example="zsdata bench --sources shards --workers 0 1 4 --depth-cache depth-cache",
+    )
+    command.add_argument("--sources", metavar="SHARDS", nargs="+", required=True, help=_URLS)
+    cores = _cores()
+    command.add_argument(
+        "--workers",
+        metavar="N",
+        nargs="+",
+        type=_count,
+        default=sorted({0, 1, cores // 2, cores}),
+        help="numbers of worker processes to try; 0, no workers, is always measured (default: 0, 1, half of the cores and all, "
+        "here %(default)s)",
+    )
+    command.add_argument("--device", metavar="NAME", default="cpu", help='that finishes the batches: "cpu" or "cuda" (default: cpu)')
+    command.add_argument("--batch-size", metavar="N", type=_positive, default=8, help="pairs per batch (default: %(default)s)")
+    command.add_argument(
+        "--pairs", metavar="N", type=_positive, default=64, help="pairs per measurement, more with many workers (default: %(default)s)"
+    )
+    _add_size(command)
+    _add_steps(command)
+    command.add_argument(
+        "--depth-cache",
+        metavar="DIR",
+        type=Path,
+        help="keep depth in this folder, made if missing, and measure as in later epochs: once the depth of each photo is there",
+    )
+    command.add_argument("--views-per-image", metavar="N", type=_positive, default=1, help="pairs from each photo (default: %(default)s)")
 
     command = add(
         _export,
@@ -169,6 +206,12 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _add_size(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--size", metavar=("HEIGHT", "WIDTH"), nargs=2, type=_positive, default=(384, 512), help="of a pair in pixels (default: 384 512)"
+    )
+
+
 def _add_steps(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--depth", metavar="NAME", default="builtin", help='"builtin", or a Hub id or folder in the transformers format (default: builtin)'
@@ -184,6 +227,11 @@ def _add_steps(command: argparse.ArgumentParser) -> None:
 
 def _add_overwrite(command: argparse.ArgumentParser) -> None:
     command.add_argument("--overwrite", action="store_true", help="replace shards that were packed into OUTPUT before, under the same name")
+
+
+def _cores() -> int:
+    """Of this machine, as far as this process may use them."""
+    return len(os.sched_getaffinity(0))
 
 
 def _count(text: str) -> int:
@@ -295,6 +343,68 @@ def _export(options: argparse.Namespace) -> int:
         reasons = ", ".join(f"{reason}: {count:,}" for reason, count in report.replaced.most_common())
         print(f"photos that could not be used and were replaced: {_printable(reasons)}")
     return OK
+
+
+def _bench(options: argparse.Namespace) -> int:
+    shards = expand_urls(options.sources)
+    device = _device(options.device)
+    depth = load_depth(options.depth)
+    samples = samples_needed(options.workers, batch_size=options.batch_size, pairs=options.pairs)
+
+    def stream_with(inpaint: Inpainter | str, augmentation: AugmentConfig | None) -> ZeroStereoStream:
+        return ZeroStereoStream(
+            shards,
+            size=tuple(options.size),
+            depth=depth if options.depth_cache is None else options.depth,  # the cache knows estimators by name
+            inpaint=inpaint,
+            seed=options.seed,
+            epoch_size=samples,
+            views_per_image=options.views_per_image,
+            depth_cache=options.depth_cache,
+            augmentation=augmentation,
+        )
+
+    stream = stream_with(options.inpaint, None)
+    if options.depth_cache is not None:
+        fill_depth_cache(stream_with(leave_holes, AugmentConfig.none()), max(options.workers), samples)
+    report = bench(stream, options.workers, batch_size=options.batch_size, pairs=options.pairs, device=device)
+    _print_bench(report, options)
+    print(advice(report, device=device, cores=_cores(), depth_cached=options.depth_cache is not None))
+    return OK
+
+
+def _device(name: str) -> torch.device:
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise ValueError(f'--device is "cpu", "cuda" or "cuda:1"; got {name!r}') from error
+    if device.type not in ("cpu", "cuda"):
+        raise ValueError(f'--device is "cpu", "cuda" or "cuda:1"; got {name!r}')
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise ValueError(f"--device {name}: PyTorch sees {_several(torch.cuda.device_count(), 'GPU')} here; use --device cpu")
+    return device
+
+
+def _print_bench(report: BenchReport, options: argparse.Namespace) -> None:
+    height, width = options.size
+    total = sum(report.worker_ms.values()) + sum(report.finish_ms.values())
+    print(f"a pair, {height} px high and {width} px wide; a decode is {report.decode_ms:.2f} ms, the mean over the same photos\n")
+    print(f"{'stage':32}{'ms a pair':>10}{'share':>8}{'decodes':>9}")
+
+    def row(name: str, ms: float) -> None:
+        print(f"{name:32}{ms:10.2f}{ms / total:8.1%}{ms / report.decode_ms:9.2f}")
+
+    for process, stages in (("a worker", report.worker_ms), ("the training process", report.finish_ms)):
+        for name, ms in stages.items():
+            row(f"  {name}" if name != REST else f"  {REST} of {process}", ms)
+        row(process, sum(stages.values()))
+    row("both", total)
+    print(f"\n{'workers':>7}{'pairs/s':>10}{'batches/s':>11}{'training waits':>16}{'batches ready':>15}")
+    for run in report.runs:
+        waiting = f"{run.waiting:.0%}" if run.workers else "-"
+        ready = f"{run.ready_batches:.1f}" if run.workers else "-"
+        print(f"{run.workers:7}{run.pairs_per_second:10.1f}{run.pairs_per_second / options.batch_size:11.2f}{waiting:>16}{ready:>15}")
+    print()
 
 
 def _take(stream: ZeroStereoStream, epoch: int, index: int, count: int) -> list[StereoBatch]:

@@ -9,15 +9,16 @@ from typing import Any
 import cv2
 import torch
 from accelerate.state import GradientState
-from torch.utils.data import DataLoader, Dataset
 
 from zsdata.faults import FailureBudget, FaultLog
 from zsdata.finish import Finisher
 from zsdata.meter import Meter
+from zsdata.pool import Job, WorkerPool
 from zsdata.position import Position
+from zsdata.prepared import Prepared, stack
 from zsdata.sample import StereoBatch
 from zsdata.synthesis.depth.builtin import BuiltinDepthWarning
-from zsdata.worker import Prepared, Worker
+from zsdata.worker import Worker
 
 PREFETCHED_BATCHES = 2  # per worker, ready or in the making
 
@@ -73,6 +74,7 @@ class StereoLoader:
         self._problems = problems
         self._meter = Meter()
         self._batches = 0
+        self._ready = 0
         # What Accelerate's gradient state reads of the loader that is being iterated.
         self.end_of_dataloader = False
         self.remainder = -1
@@ -135,13 +137,15 @@ class StereoLoader:
     def stats(self) -> dict[str, Any]:
         """What this rank has seen so far.
 
-        `batches`, `pairs`; `rejected`: photos refused, by reason; `examples`: (source, shard, key, reason) of the first ones;
-        `shard_problems`: faults of the shards themselves, by reason; `seconds`: time by stage, those of the workers added up over all of
-        them, "wait" being how long the training process stood still for lack of a prepared batch.
+        `batches`, `pairs`; `ready_batches`: how many prepared batches lay ready when one was asked for, on average; `rejected`: photos
+        refused, by reason; `examples`: (source, shard, key, reason) of the first ones; `shard_problems`: faults of the shards themselves,
+        by reason; `seconds`: time by stage, those of the workers added up over all of them, "wait" being how long the training process
+        stood still for lack of a prepared batch.
         """
         return {
             "batches": self._batches,
             "pairs": self._batches * self.batch_size,
+            "ready_batches": self._ready / max(1, self._batches),
             "rejected": dict(self._faults.by_reason),
             "examples": list(self._faults.examples),
             "shard_problems": dict(self._problems()),
@@ -183,6 +187,7 @@ class StereoLoader:
             self._pipeline = _Pipeline(
                 self._worker, self._requests(self._epoch, self._samples), self._num_workers, self.device, self._context, self._revision()
             )
+        self._ready += self._pipeline.ready
         prepared = next(self._pipeline)
         expected = self._indices(self._samples)
         if [(meta["epoch"], meta["index"]) for meta in prepared.meta] != [(self._epoch, index) for index in expected]:
@@ -205,18 +210,8 @@ class StereoLoader:
             self._check_epoch(epoch)
 
 
-class _Samples(Dataset):
-    """What a DataLoader needs to know of a worker: (epoch, index) in, a prepared sample out."""
-
-    def __init__(self, worker: Worker) -> None:
-        self._worker = worker
-
-    def __getitem__(self, request: tuple[int, int]) -> Prepared:
-        return self._worker.prepare(*request)
-
-
 class _Pipeline:
-    """Prepared batches in the order of the requests; torch's DataLoader does the plumbing between the processes."""
+    """Prepared batches in the order of the requests, made by worker processes or, without any, in this one."""
 
     def __init__(
         self,
@@ -225,39 +220,40 @@ class _Pipeline:
         num_workers: int,
         device: torch.device,
         context: str | None,
+        timeout_seconds: float,
         revision: int,
     ) -> None:
         self.revision = revision
-        several: dict[str, Any] = {}
+        self._pool: WorkerPool | None = None
+        self._pin = device.type == "cuda"
         if num_workers:
-            several = {
-                "prefetch_factor": PREFETCHED_BATCHES,
-                "multiprocessing_context": context,
-                "worker_init_fn": _start_worker,
-            }
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "This DataLoader will create")  # how many processes to start is the user's decision
-            loader = DataLoader(
-                _Samples(worker),
-                batch_sampler=requests,  # type: ignore[arg-type]  # any iterable of lists of what the dataset is asked for
-                num_workers=num_workers,
-                collate_fn=Prepared.stack,
-                pin_memory=device.type == "cuda",
-                **several,
+            self._pool = WorkerPool(
+                Job(_start_worker, worker.prepare, stack),
+                requests,
+                processes=num_workers,
+                ahead=PREFETCHED_BATCHES,
+                context=context,
+                timeout_seconds=timeout_seconds,
             )
-            self._batches = iter(loader)
+            self._batches: Iterator[Any] = self._pool
+        else:
+            self._batches = (stack([worker.prepare(*sample) for sample in request]) for request in requests)
 
-    def __next__(self) -> Prepared:
-        return next(self._batches)
+    def __next__(self) -> Any:
+        prepared = next(self._batches)
+        return prepared.pin_memory() if self._pin else prepared
+
+    @property
+    def ready(self) -> int:
+        """Prepared batches that wait to be taken."""
+        return 0 if self._pool is None else self._pool.ready
 
     def close(self) -> None:
-        shutdown = getattr(self._batches, "_shutdown_workers", None)
-        if shutdown is not None:
-            shutdown()
+        if self._pool is not None:
+            self._pool.close()
 
 
-def _start_worker(worker_id: int) -> None:
-    del worker_id
+def _start_worker() -> None:
     warnings.simplefilter("ignore", BuiltinDepthWarning)  # the process that opened the stream has said it
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
