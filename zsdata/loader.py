@@ -9,16 +9,15 @@ from typing import Any
 import cv2
 import torch
 from accelerate.state import GradientState
+from torch.utils.data import DataLoader, Dataset
 
 from zsdata.faults import FailureBudget, FaultLog
 from zsdata.finish import Finisher
 from zsdata.meter import Meter
-from zsdata.pool import Job, WorkerPool
 from zsdata.position import Position
-from zsdata.prepared import Prepared, stack
 from zsdata.sample import StereoBatch
 from zsdata.synthesis.depth.builtin import BuiltinDepthWarning
-from zsdata.worker import Worker
+from zsdata.worker import Prepared, Worker
 
 PREFETCHED_BATCHES = 2  # per worker, ready or in the making
 
@@ -210,8 +209,18 @@ class StereoLoader:
             self._check_epoch(epoch)
 
 
+class _Samples(Dataset):
+    """What a DataLoader needs to know of a worker: (epoch, index) in, a prepared sample out."""
+
+    def __init__(self, worker: Worker) -> None:
+        self._worker = worker
+
+    def __getitem__(self, request: tuple[int, int]) -> Prepared:
+        return self._worker.prepare(*request)
+
+
 class _Pipeline:
-    """Prepared batches in the order of the requests, made by worker processes or, without any, in this one."""
+    """Prepared batches in the order of the requests; torch's DataLoader does the plumbing between the processes."""
 
     def __init__(
         self,
@@ -220,40 +229,48 @@ class _Pipeline:
         num_workers: int,
         device: torch.device,
         context: str | None,
-        timeout_seconds: float,
         revision: int,
     ) -> None:
         self.revision = revision
-        self._pool: WorkerPool | None = None
-        self._pin = device.type == "cuda"
+        self._num_workers = num_workers
+        several: dict[str, Any] = {}
         if num_workers:
-            self._pool = WorkerPool(
-                Job(_start_worker, worker.prepare, stack),
-                requests,
-                processes=num_workers,
-                ahead=PREFETCHED_BATCHES,
-                context=context,
-                timeout_seconds=timeout_seconds,
+            several = {
+                "prefetch_factor": PREFETCHED_BATCHES,
+                "multiprocessing_context": context,
+                "worker_init_fn": _start_worker,
+            }
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "This DataLoader will create")  # how many processes to start is the user's decision
+            loader = DataLoader(
+                _Samples(worker),
+                batch_sampler=requests,  # type: ignore[arg-type]  # any iterable of lists of what the dataset is asked for
+                num_workers=num_workers,
+                collate_fn=Prepared.stack,
+                pin_memory=device.type == "cuda",
+                **several,
             )
-            self._batches: Iterator[Any] = self._pool
-        else:
-            self._batches = (stack([worker.prepare(*sample) for sample in request]) for request in requests)
+            self._batches: Any = iter(loader)
 
-    def __next__(self) -> Any:
-        prepared = next(self._batches)
-        return prepared.pin_memory() if self._pin else prepared
+    def __next__(self) -> Prepared:
+        return next(self._batches)
 
     @property
     def ready(self) -> int:
         """Prepared batches that wait to be taken."""
-        return 0 if self._pool is None else self._pool.ready
+        if not self._num_workers:
+            return 0
+        set_aside = sum(len(task) == 2 for task in self._batches._task_info.values())  # (worker, batch): it overtook the one before it
+        return self._batches._data_queue.qsize() + set_aside
 
     def close(self) -> None:
-        if self._pool is not None:
-            self._pool.close()
+        shutdown = getattr(self._batches, "_shutdown_workers", None)
+        if shutdown is not None:
+            shutdown()
 
 
-def _start_worker() -> None:
+def _start_worker(worker_id: int) -> None:
+    del worker_id
     warnings.simplefilter("ignore", BuiltinDepthWarning)  # the process that opened the stream has said it
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
