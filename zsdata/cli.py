@@ -150,7 +150,7 @@ def _parser() -> argparse.ArgumentParser:
         "the pairs per second for several numbers of workers; and, in words, what bounds them and what to change. Every run makes the same "
         "pairs, so after the first one the photos come from the system's memory. With nothing else on the machine, and without training "
         "on the GPU, these are the most that training can get.",
-        example="zsdata bench --sources shards --workers 0 1 4 --depth-cache depth-cache",
+        example="zsdata bench --sources shards --workers 1 4 --depth-cache depth",
     )
     command.add_argument("--sources", metavar="SHARDS", nargs="+", required=True, help=_URLS)
     cores = _cores()
