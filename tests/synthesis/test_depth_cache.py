@@ -14,11 +14,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from zsdata import folder_ledger
+from zsdata.bounded_folder import SMALLEST_BOUND_BYTES as SMALLEST_CACHE_BYTES
+from zsdata.folder_ledger import ledger_name, open_ledger
 from zsdata.synthesis.depth import cache as cache_module
-from zsdata.synthesis.depth import cache_ledger
-from zsdata.synthesis.depth.cache import SMALLEST_CACHE_BYTES, DepthCache, photo_digest
+from zsdata.synthesis.depth.cache import DepthCache, photo_digest
 from zsdata.synthesis.depth.cache_entry import BAND_ROWS
-from zsdata.synthesis.depth.cache_ledger import LEDGER_NAME, open_ledger
 
 PLENTY = 100 << 20
 
@@ -73,7 +74,7 @@ def entry_path(cache, number):
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
-    monkeypatch.setattr(cache_ledger, "RECOUNT_PAUSE", 0.0)
+    monkeypatch.setattr(folder_ledger, "RECOUNT_PAUSE", 0.0)
     return DepthCache(tmp_path / "depth", PLENTY, "estimator 1")
 
 
@@ -247,7 +248,7 @@ def test_all_workers_together_say_once_that_the_cache_is_full(tmp_path, warnings
 
 
 def test_room_that_another_estimator_gives_back_is_used(tmp_path, monkeypatch):
-    monkeypatch.setattr(cache_ledger, "RECOUNT_PAUSE", 0.0)
+    monkeypatch.setattr(folder_ledger, "RECOUNT_PAUSE", 0.0)
     cache, other = (DepthCache(tmp_path, SMALLEST_CACHE_BYTES, name) for name in ("estimator 1", "estimator 2"))
     assert other.store(key(0), *maps(0, 500, 500)) and not cache.store(key(0), *maps(0, 500, 500))
     path = entry_path(other, 0)
@@ -259,11 +260,11 @@ def test_room_that_another_estimator_gives_back_is_used(tmp_path, monkeypatch):
 
 
 def test_a_full_folder_is_not_counted_for_every_photo(tmp_path, monkeypatch):
-    monkeypatch.setattr(cache_ledger, "RECOUNT_PAUSE", 1e9)
-    counts, count = [], cache_ledger.count_shelf
-    monkeypatch.setattr(cache_ledger, "count_shelf", lambda shelf: counts.append(shelf) or count(shelf))
+    monkeypatch.setattr(folder_ledger, "RECOUNT_PAUSE", 1e9)
+    counts, count = [], folder_ledger.count_shelf
+    monkeypatch.setattr(folder_ledger, "count_shelf", lambda shelf, kind: counts.append(shelf) or count(shelf, kind))
     cache = DepthCache(tmp_path, SMALLEST_CACHE_BYTES, "estimator 1")
-    with open_ledger(cache.folder) as ledger:
+    with open_ledger(cache.folder, "depth") as ledger:
         ledger.count_if_due()
     assert not any(cache.store(key(number), *maps(number, 1000, 1000)) for number in range(20))
     assert counts == []
@@ -273,7 +274,7 @@ def test_storing_anew_takes_no_more_room(cache):
     held = set()
     for _ in range(5):
         assert cache.store(key(1), *maps(1))
-        with open_ledger(cache.folder) as ledger:
+        with open_ledger(cache.folder, "depth") as ledger:
             held.add(ledger.held_bytes)
     assert len(held) == 1
 
@@ -285,7 +286,7 @@ def counted(folder):
 
 
 def held_bytes(folder):
-    with open_ledger(str(folder)) as ledger:
+    with open_ledger(str(folder), "depth") as ledger:
         return ledger.held_bytes
 
 
@@ -299,7 +300,7 @@ def test_the_ledger_holds_what_lies_in_the_folder(cache):
 @pytest.mark.parametrize("damage", ["missing", "empty", "cut", "long", "flipped", "foreign"])
 def test_a_ledger_that_cannot_be_believed_is_counted_anew(cache, damage):
     cache.store(key(1), *maps(1))
-    path = os.path.join(cache.folder, LEDGER_NAME)
+    path = os.path.join(cache.folder, ledger_name("depth"))
     with open(path, "rb") as file:
         data = file.read()
     if damage == "missing":
@@ -352,7 +353,7 @@ def test_a_full_disk_is_said_once_and_the_rest_goes_on(cache, monkeypatch, warni
     assert cache.folder in said and "No space left on device" in said and "free space" in said
     assert files(cache.folder, ".tmp") == [] and held_bytes(cache.folder) == held == counted(cache.folder)
     assert is_stored(cache.load(key(1)), 1)
-    monkeypatch.setattr(cache, "_retry_at", time.monotonic())  # a minute later
+    monkeypatch.setattr(cache._kept, "_retry_at", time.monotonic())  # a minute later
     assert cache.store(key(2), *maps(2)) and len(warnings_said()) == 1
 
 
@@ -373,9 +374,9 @@ def test_a_folder_that_became_read_only_is_said_once(cache, monkeypatch, warning
 
 
 def test_a_process_that_never_lets_go_of_the_lock_stops_nobody(cache, monkeypatch, warnings_said):
-    monkeypatch.setattr(cache_ledger, "LOCK_SECONDS", 0.05)
+    monkeypatch.setattr(folder_ledger, "LOCK_SECONDS", 0.05)
     cache.store(key(1), *maps(1))
-    with open_ledger(cache.folder):
+    with open_ledger(cache.folder, "depth"):
         assert cache.store(key(2), *maps(2)) is False
         assert is_stored(cache.load(key(1)), 1)
         assert is_stored(DepthCache(cache.folder, PLENTY, "estimator 1").load(key(1)), 1)
@@ -423,7 +424,7 @@ def test_a_folder_that_cannot_be_made_or_written_is_named(tmp_path):
     for folder in (tmp_path / "file", tmp_path / "file" / "depth", "/proc/depth"):
         with pytest.raises(OSError, match=f"folder {folder} cannot be used"):
             DepthCache(folder, PLENTY, "estimator 1")
-    shelf = DepthCache(tmp_path / "a", PLENTY, "estimator 1")._shelf
+    shelf = DepthCache(tmp_path / "a", PLENTY, "estimator 1")._kept._shelf
     (tmp_path / "b").mkdir()
     write(os.path.join(tmp_path / "b", os.path.basename(shelf)), b"a file where a folder should be")
     with pytest.raises(OSError, match="b cannot be used"):
@@ -468,7 +469,7 @@ def store_and_load(cache, seed, rounds):
             cache.store(key(number), *maps(estimated(cache, number), *SIZE))
         if generator.random() < 0.2:
             with suppress(FileNotFoundError):  # damage, so that room is found again and again
-                os.truncate(cache._path(key(number)), 5000)
+                os.truncate(cache._kept.path(key(number)), 5000)
 
 
 def estimated(cache, number):
@@ -509,7 +510,7 @@ def test_many_processes_never_exceed_the_bound_and_never_read_wrong_values(tmp_p
         child.start()
     most = 0
     while any(child.is_alive() for child in children):
-        with open_ledger(str(tmp_path)) as ledger:  # nothing appears, grows or is renamed meanwhile
+        with open_ledger(str(tmp_path), "depth") as ledger:  # nothing appears, grows or is renamed meanwhile
             most = max(most, bytes_in(tmp_path))
             assert counted(tmp_path) <= ledger.held_bytes <= SMALLEST_CACHE_BYTES
         time.sleep(0.005)
@@ -553,7 +554,7 @@ def test_writers_killed_in_the_middle_leave_a_cache_that_works(tmp_path, monkeyp
         for child in children:
             child.join()
         assert counted(tmp_path) <= held_bytes(tmp_path) <= SMALLEST_CACHE_BYTES
-    monkeypatch.setattr(cache_ledger, "RECOUNT_PAUSE", 0.0)
+    monkeypatch.setattr(folder_ledger, "RECOUNT_PAUSE", 0.0)
     again = DepthCache(tmp_path, SMALLEST_CACHE_BYTES, "estimator 1")
     assert files(tmp_path, ".tmp") == [] and held_bytes(tmp_path) == counted(tmp_path)
     for number in range(10):

@@ -7,7 +7,6 @@ crop is two reads, and what it does not need is neither read nor checked.
 from __future__ import annotations
 
 import os
-import stat
 import struct
 import zlib
 from collections.abc import Iterator
@@ -15,6 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from zsdata.bounded_folder import BadEntry
 
 MAGIC = b"zsdepth\n"
 VERSION = 1
@@ -27,10 +28,6 @@ FIRST_READ_BYTES = 4096  # holds header and table of photos of up to 7,984 rows
 DEPTH_DTYPE = np.dtype("<u2")
 CONFIDENCE_DTYPE = np.dtype("u1")
 PIXEL_BYTES = DEPTH_DTYPE.itemsize + CONFIDENCE_DTYPE.itemsize
-
-
-class BadEntry(Exception):
-    """The file is not what was stored for this photo and estimator; the message says why."""
 
 
 class CachedDepth(NamedTuple):
@@ -71,16 +68,13 @@ def pack_entry(
         yield plane.reshape(-1).view(np.uint8).data
 
 
-def read_entry(descriptor: int, identity: bytes, photo: bytes, rows: tuple[int, int] | None) -> CachedDepth | None:
-    """Rows `rows[0]` to `rows[1]` (exclusive) of an open file, or all; None where the map has not all of them.
+def read_entry(descriptor: int, size: int, identity: bytes, photo: bytes, rows: tuple[int, int] | None) -> CachedDepth | None:
+    """Rows `rows[0]` to `rows[1]` (exclusive) of an open file of `size` bytes, or all; None where the map has not all of them.
 
     Raises:
         BadEntry: the file has another size than its header says, is of another version, estimator or photo, or a checksum is wrong.
         OSError: the file cannot be read.
     """
-    status = os.fstat(descriptor)
-    if not stat.S_ISREG(status.st_mode):
-        raise BadEntry("not a regular file")
     begin = os.pread(descriptor, FIRST_READ_BYTES, 0)
     if len(begin) < HEADER.size:
         raise BadEntry(f"it ends inside the header, after {len(begin)} bytes")
@@ -91,8 +85,8 @@ def read_entry(descriptor: int, identity: bytes, photo: bytes, rows: tuple[int, 
         raise BadEntry("damaged header")
     table_end = HEADER.size + _table_bytes(height, band_rows)
     expected_bytes = table_end + height * width * PIXEL_BYTES
-    if status.st_size != expected_bytes:
-        raise BadEntry(f"{status.st_size:,} bytes instead of {expected_bytes:,}")
+    if size != expected_bytes:
+        raise BadEntry(f"{size:,} bytes instead of {expected_bytes:,}")
     if table_end > len(begin):
         begin += os.pread(descriptor, table_end - len(begin), len(begin))
     table_bytes = begin[HEADER.size : table_end]

@@ -1,7 +1,8 @@
-"""How many bytes a depth cache holds: one number for all processes, in a small file that is also their lock.
+"""How many bytes a cache's folder holds: one number for all processes, in a small file that is also their lock.
 
 The number may be too high (after a process was killed), never too low: it grows before a file does, and shrinks after one is gone.
-Only files with names of ours are counted or removed.
+Only files with names of ours are counted or removed. Of what kind the cache is ("depth", "shard"), is part of these names, so that caches of
+two kinds may share a folder.
 """
 
 from __future__ import annotations
@@ -15,10 +16,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-LEDGER_NAME = "depth-cache.ledger"
-SHELF_NAME = re.compile(r"depth-[0-9a-f]{16}")  # the folder of one estimator
-IDENTITY_NAME = "identity.txt"
-ENTRY_NAME = re.compile(r"[0-9a-f]{64}\.depth")
+IDENTITY_NAME = "identity.txt"  # in each shelf: what its entries depend on
 TEMPORARY_NAME = re.compile(r"[0-9a-f]{64}\.[0-9a-f]{16}\.tmp")
 
 BLOCK_BYTES = 4096  # file systems give space in such blocks
@@ -33,11 +31,17 @@ CHECKSUM = struct.Struct("<I")
 TOKEN_BYTES = 8
 
 
+def ledger_name(kind: str) -> str:
+    """The file's name in the folder."""
+    return f"{kind}-cache.ledger"
+
+
 class Ledger:
     """The number, while its lock is held; made by `open_ledger`."""
 
-    def __init__(self, folder: str, descriptor: int) -> None:
+    def __init__(self, folder: str, kind: str, descriptor: int) -> None:
         self._folder = folder
+        self._kind = kind
         self._descriptor = descriptor
         data = os.pread(descriptor, RECORD.size + CHECKSUM.size + 1, 0)
         record, checksum = data[: RECORD.size], data[RECORD.size :]
@@ -80,7 +84,7 @@ class Ledger:
     def _count(self) -> None:
         start = time.monotonic()
         self.held_bytes = charge(0) + charge(RECORD.size)  # the folder and this file
-        self.held_bytes += sum(count_shelf(shelf) for shelf in shelves(self._folder))
+        self.held_bytes += sum(count_shelf(shelf, self._kind) for shelf in shelves(self._folder, self._kind))
         self._counted_at, self._count_seconds = time.time(), time.monotonic() - start
         self._save()
 
@@ -90,21 +94,24 @@ class Ledger:
 
 
 @contextmanager
-def open_ledger(folder: str) -> Iterator[Ledger]:
+def open_ledger(folder: str, kind: str) -> Iterator[Ledger]:
     """The ledger of a cache's folder; no other process has it meanwhile.
+
+    Args:
+        kind: of the cache, lower-case letters.
 
     Raises:
         TimeoutError: another process has held it for LOCK_SECONDS.
         OSError: the file cannot be made, locked, read or written.
     """
-    path = os.path.join(folder, LEDGER_NAME)
+    path = os.path.join(folder, ledger_name(kind))
     deadline = time.monotonic() + LOCK_SECONDS
     while (descriptor := _try_lock(path)) is None:
         if time.monotonic() > deadline:
             raise TimeoutError(f"another process has held {path} for {LOCK_SECONDS:g} s")
         time.sleep(LOCK_POLL_SECONDS)
     try:
-        yield Ledger(folder, descriptor)
+        yield Ledger(folder, kind, descriptor)
     finally:
         fcntl.flock(descriptor, fcntl.LOCK_UN)  # closing is not enough: a process forked meanwhile has the descriptor too
         os.close(descriptor)
@@ -130,19 +137,21 @@ def charge(size: int) -> int:
     return max(1, -(-size // BLOCK_BYTES)) * BLOCK_BYTES + NAME_BYTES
 
 
-def shelves(folder: str) -> list[str]:
-    """Paths of the estimators' folders in a cache."""
+def shelves(folder: str, kind: str) -> list[str]:
+    """Paths of the shelves in a cache: folders whose entries depend on the same."""
+    name = re.compile(rf"{kind}-[0-9a-f]{{16}}")
     with os.scandir(folder) as found:
-        return sorted(place.path for place in found if SHELF_NAME.fullmatch(place.name) and place.is_dir())
+        return sorted(place.path for place in found if name.fullmatch(place.name) and place.is_dir())
 
 
-def count_shelf(shelf: str) -> int:
-    """Bytes in the folder of one estimator, itself included; temporary files that no process writes any more are removed."""
+def count_shelf(shelf: str, kind: str) -> int:
+    """Bytes in a shelf, itself included; temporary files that no process writes any more are removed."""
+    entry = re.compile(rf"[0-9a-f]{{64}}\.{kind}")
     total = charge(0)
     with suppress(FileNotFoundError), os.scandir(shelf) as found:  # removed by hand, meanwhile
         for place in found:
             temporary = TEMPORARY_NAME.fullmatch(place.name)
-            if not (temporary or ENTRY_NAME.fullmatch(place.name) or place.name == IDENTITY_NAME):
+            if not (temporary or entry.fullmatch(place.name) or place.name == IDENTITY_NAME):
                 continue
             with suppress(FileNotFoundError):
                 if not (temporary and _remove_abandoned(place.path)):
