@@ -1,56 +1,266 @@
-import warnings
+import json
+import logging
+import math
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+import types
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
+from safetensors.torch import load_file, save_file
 
-from tests.scenes import grey_fill, photo_tar
+from tests.scenes import grey_fill, photo, photo_tar
 from zsdata import ZeroStereoStream, load_depth
+from zsdata.synthesis.depth.identity import depth_identity
+from zsdata.synthesis.depth.options import DepthNetwork
+from zsdata.synthesis.depth.pretrained import SMALLEST_DEPTH_M, _predicts, load_preprocessing
 
 transformers = pytest.importorskip("transformers")
+small = pytest.importorskip("tests.small_depth_networks")
+
+PREDICT_DEPTH = {"metric_depth_anything", "dinov2_dpt", "glpn", "zoe"}
+PIL_PROCESSORS = {"DPTImageProcessor", "GLPNImageProcessor", "ZoeDepthImageProcessor"}  # the others need torchvision
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A small Depth Anything V2 with random weights, saved by transformers itself in its real format."""
-    backbone = transformers.Dinov2Config(
-        hidden_size=32, num_hidden_layers=4, num_attention_heads=2, mlp_ratio=2, image_size=70, patch_size=14,
-        out_features=["stage1", "stage2", "stage3", "stage4"], reshape_hidden_states=False,
-    )  # fmt: skip
-    config = transformers.DepthAnythingConfig(
-        backbone_config=backbone,
-        reassemble_hidden_size=32,
-        neck_hidden_sizes=[8, 16, 24, 32],
-        fusion_hidden_size=16,
-        head_hidden_size=8,
-        patch_size=14,
-    )
-    path = tmp_path_factory.mktemp("depth_anything")
-    torch.manual_seed(0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        transformers.DepthAnythingForDepthEstimation(config).save_pretrained(path)
-    (path / "preprocessor_config.json").write_text(
-        '{"image_processor_type": "DPTImageProcessor", "size": {"height": 70, "width": 70}, "keep_aspect_ratio": true,'
-        ' "ensure_multiple_of": 14, "image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}'
-    )
-    return path
+@pytest.fixture(scope="session")
+def folders(tmp_path_factory):
+    """A folder of each kind of network, saved when it is first asked for."""
+    root, saved = tmp_path_factory.mktemp("networks"), {}
+    return lambda kind: saved.setdefault(kind, None) or saved.update({kind: small.save_small_network(kind, root / kind)}) or saved[kind]
 
 
-def test_a_saved_network_gives_a_finite_map_of_the_photos_size(folder):
-    images = torch.rand(2, 3, 90, 131) * 255
-    depth = load_depth(folder)(images)
+@pytest.fixture(scope="session")
+def folder(folders):
+    return folders("depth_anything")
+
+
+@pytest.fixture
+def copy(folder, tmp_path):
+    """A Depth Anything in a folder of its own, to be changed."""
+    return shutil.copytree(folder, tmp_path / "copy")
+
+
+def photos(count, height=90, width=131, first_seed=0):
+    """float32 [B, 3, H, W], whole numbers 0..255."""
+    made = [torch.from_numpy(photo(first_seed + seed, height, width)).permute(2, 0, 1) for seed in range(count)]
+    return torch.stack(made).float()
+
+
+def change(folder, name, **values):
+    path = folder / name
+    path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
+
+
+@pytest.mark.parametrize("kind", small.NETWORKS)
+def test_every_kind_of_network_gives_a_finite_map_of_the_photos_size(folders, kind):
+    images = photos(2)
+    depth = load_depth(folders(kind))(images)
     assert depth.shape == (2, 1, 90, 131) and depth.dtype == torch.float32
-    assert torch.isfinite(depth).all() and depth.std() > 0
+    assert torch.isfinite(depth).all() and depth.std() > 0 and not torch.equal(depth[0], depth[1])
+
+
+@pytest.mark.parametrize(
+    ("kind", "height", "width"),
+    [
+        ("depth_anything", 90, 131),
+        ("metric_depth_anything", 160, 100),
+        ("midas_vit", 90, 131),
+        ("midas_beit", 90, 131),
+        ("midas_swin", 90, 131),
+        ("dinov2_dpt", 84, 126),  # where the size is right already: transformers pads or cuts where this resizes
+        ("glpn", 96, 128),
+        ("zoe", 90, 131),
+    ],
+)
+@pytest.mark.skipif(not hasattr(transformers, "DPTImageProcessorPil"), reason="its image processors need torchvision")
+def test_the_result_is_that_of_transformers_own_processor_and_model(folders, kind, height, width):
+    path, image = folders(kind), photo(0, height, width)
+    processor = getattr(transformers, f"{small.NETWORKS[kind][1]}Pil").from_pretrained(path)
+    network = transformers.AutoModelForDepthEstimation.from_pretrained(path).eval()
+    depth = load_depth(path)
+    pixels = processor(images=[image], return_tensors="pt")["pixel_values"].float()
+    tensor = torch.from_numpy(image).permute(2, 0, 1)[None]
+    levels = (pixels - depth.preprocessing.normalise(depth.prepare(tensor))) * torch.tensor(depth.preprocessing.std).view(3, 1, 1) * 255
+    assert levels.abs().max() < 1.001  # PIL rounds a few pixels to the neighbouring grey level; ZoeDepth's does not round
+    assert levels.abs().mean() < (0.3 if kind == "zoe" else 0.01)
+    with torch.no_grad():
+        predicted = network(pixel_values=pixels).predicted_depth
+    inverse = 1 / predicted.clamp(min=SMALLEST_DEPTH_M) if kind in PREDICT_DEPTH else predicted
+    rows, columns = (int(math.sqrt(side / 2) * 3) if kind == "zoe" else 0 for side in (height, width))
+    expected = F.interpolate(inverse[None], (height + 2 * rows, width + 2 * columns), mode="bilinear")
+    expected = expected[..., rows : rows + height, columns : columns + width]
+    assert (depth(tensor.float()) - expected).abs().max() < 0.02 * (expected.max() - expected.min())
+
+
+def test_depth_pro_is_given_its_square_and_not_inverted(folders):
+    """transformers turns Depth Pro's prediction, which is inverse depth, into depth only after the network."""
+    path, images = folders("depth_pro"), photos(1)
+    network = transformers.AutoModelForDepthEstimation.from_pretrained(path).eval()
+    with torch.no_grad():
+        predicted = network(pixel_values=F.interpolate(images, (56, 56), mode="bilinear") / 127.5 - 1).predicted_depth
+    expected = F.interpolate(predicted[None], (90, 131), mode="bilinear")
+    assert (load_depth(path)(images) - expected).abs().max() < 0.02 * (expected.max() - expected.min())
 
 
 def test_the_network_sees_what_its_folder_says(folder, monkeypatch):
     depth, seen = load_depth(folder), []
     network = depth._network
     monkeypatch.setattr(depth, "_network", lambda pixel_values: seen.append(pixel_values) or network(pixel_values=pixel_values))
-    depth(torch.full((1, 3, 100, 200), 127.5))
+    depth(torch.full((1, 3, 100, 200), 128.0))
     assert seen[0].shape == (1, 3, 70, 140)  # the short side, whole patches, the aspect kept
-    expected = (0.5 - torch.tensor([0.485, 0.456, 0.406])) / torch.tensor([0.229, 0.224, 0.225])
+    expected = (128 / 255 - torch.tensor([0.485, 0.456, 0.406])) / torch.tensor([0.229, 0.224, 0.225])
     assert torch.allclose(seen[0].mean((0, 2, 3)), expected, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("resolution", "size", "expected"),
+    [
+        (None, (90, 131), (70, 98)),
+        (None, (290, 200), (98, 70)),
+        (None, (30, 40), (70, 98)),  # small photos grow
+        (140, (90, 131), (140, 210)),
+        (150, (1000, 1000), (154, 154)),
+        ("native", (90, 131), (84, 126)),
+        ("native", (5, 700), (14, 700)),
+    ],
+)
+def test_the_resolution_is_a_short_side_in_whole_patches(folder, resolution, size, expected):
+    assert load_preprocessing(DepthNetwork(str(folder), resolution)).input_size(*size) == expected
+    assert load_depth(folder, resolution=resolution).prepare(torch.zeros(1, 3, *size)).shape[-2:] == expected
+
+
+def test_networks_that_take_squares_get_squares(folders):
+    assert load_depth(folders("midas_vit"), resolution=96).prepare(photos(1)).shape[-2:] == (96, 96)
+    assert load_depth(folders("midas_vit"), resolution=96)(photos(1)).shape == (1, 1, 90, 131)
+    with pytest.raises(ValueError, match='takes squares alone: resolution is a number of pixels or None; got "native"'):
+        load_depth(folders("midas_vit"), resolution="native")
+    with pytest.raises(ValueError, match="takes 56x56 pixels and nothing else; got resolution=112"):
+        load_depth(folders("depth_pro"), resolution=112)
+
+
+@pytest.mark.parametrize("kind", small.NETWORKS)
+def test_the_mirrored_photos_input_is_the_mirror_image(folders, kind):
+    prepare = load_preprocessing(DepthNetwork(str(folders(kind)))).prepare
+    images = photos(2, 91, 130)
+    there, back = prepare(images), prepare(images.flip(-1)).flip(-1)
+    assert there.dtype == torch.uint8
+    if kind in ("zoe", "depth_pro"):  # resized without smoothing, in float32, where halves may be rounded either way
+        assert (there.int() - back.int()).abs().max() <= 1
+    else:
+        assert torch.equal(there, back)
+
+
+def test_photo_and_mirrored_photo_go_together_and_give_what_each_gives(folder):
+    images, depth = photos(3), load_depth(folder)
+    one, mirrored = depth.with_mirrored(images)
+    assert torch.equal(one, depth(images))
+    assert torch.equal(mirrored, depth(images.flip(-1)).flip(-1))
+    assert (one - mirrored).abs().max() > 0.01
+
+
+def test_the_two_halves_in_two_places_are_the_whole(folder):
+    """What a worker prepares and sends, predicted elsewhere, photos of many sizes together."""
+    depth = load_depth(folder)
+    preprocessing = pickle.loads(pickle.dumps(load_preprocessing(DepthNetwork(str(folder)))))
+    sizes = [(90, 131), (131, 90), (90, 131), (64, 64), (92, 132)]
+    images = [photos(1, *size, first_seed=seed) for seed, size in enumerate(sizes)]
+    inputs = [preprocessing.prepare(image.to(torch.uint8)) for image in images]
+    assert inputs[0].shape == inputs[4].shape
+    made = depth.predict_mirrored(inputs, sizes)
+    for image, (one, mirrored) in zip(images, made, strict=True):
+        expected = depth.with_mirrored(image)
+        assert torch.equal(one, expected[0]) and torch.equal(mirrored, expected[1])
+    with pytest.raises(ValueError, match="one size per photo: 5 inputs, 4 sizes"):
+        depth.predict(inputs, sizes[:4])
+
+
+@pytest.mark.parametrize("kind", ["depth_anything", "midas_swin", "glpn"])
+def test_a_photo_does_not_depend_on_the_photos_beside_it(folders, kind):
+    images, depth = photos(4), load_depth(folders(kind))
+    together = depth(images)
+    assert all(torch.equal(depth(images[i : i + 1]), together[i : i + 1]) for i in range(4))
+    order = [2, 0]
+    assert torch.equal(depth(images[order]), together[order])
+
+
+def test_micro_batches_hold_photos_of_one_size_as_many_as_fit(folder, monkeypatch):
+    depth, seen = load_depth(folder, micro_batch=3), []
+    network = depth._network
+    monkeypatch.setattr(
+        depth, "_network", lambda pixel_values: seen.append(tuple(pixel_values.shape)) or network(pixel_values=pixel_values)
+    )
+    depth.micro_batch.size = 3  # as on a GPU
+    wide, tall = photos(2), photos(1, 131, 90)
+    inputs = [depth.prepare(image) for image in (wide[:1], tall, wide[1:])]
+    made = depth.predict_mirrored(inputs, [(90, 131), (131, 90), (90, 131)])
+    assert seen == [(3, 3, 70, 98), (1, 3, 70, 98), (2, 3, 98, 70)]
+    assert torch.allclose(torch.cat([made[0][0], made[2][0]]), load_depth(folder)(wide), rtol=0, atol=1e-4)
+
+
+def test_memory_that_runs_out_lowers_the_micro_batch_and_then_names_the_cure(folder, monkeypatch, caplog):
+    depth = load_depth(folder)
+    network, most = depth._network, 2
+
+    def limited(pixel_values):
+        if len(pixel_values) > most:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        return network(pixel_values=pixel_values)
+
+    monkeypatch.setattr(depth, "_network", limited)
+    depth.micro_batch.size = 5
+    with caplog.at_level(logging.WARNING, "zsdata"):
+        assert depth(photos(5)).shape == (5, 1, 90, 131)
+    assert (depth.micro_batch.size, depth.micro_batch.lowered) == (2, 1)
+    assert "from now on it takes 2" in caplog.text
+    most = 0
+    with pytest.raises(MemoryError, match=r"one sample \(depth network\): lower resolution"):
+        depth(photos(1))
+
+
+def test_half_precision_keeps_fine_steps(folder):
+    """The last layers stay in float32: depth is not rounded to the 256 steps that bfloat16 has between powers of two."""
+    images = photos(1)
+    exact, half = load_depth(folder)(images), load_depth(folder, dtype="bf16")(images)
+    assert half.dtype == torch.float32 and 0 < (half - exact).abs().mean() < 0.05 * exact.std()
+    with torch.autocast("cpu", torch.bfloat16):
+        coarse = load_depth(folder)._network(pixel_values=torch.randn(1, 3, 70, 98)).predicted_depth
+    fine = load_depth(folder, dtype="bf16")
+    steps = fine.predict([fine.prepare(images)], [(70, 98)])[0]
+    assert len(coarse.unique()) < 1000 < len(steps.unique())
+
+
+def test_an_autocast_around_it_changes_nothing(folder):
+    depth = load_depth(folder)
+    with torch.autocast("cpu", torch.bfloat16):
+        made = depth(photos(1))
+    assert torch.equal(made, depth(photos(1)))
+
+
+@pytest.mark.filterwarnings("ignore:.*script_method.*:DeprecationWarning")  # PyTorch's own compiler
+def test_a_compiled_network_is_used(folder):
+    compiled, plain = load_depth(folder, compile=True), load_depth(folder)
+    assert compiled._network._compiled_call_impl is not None and plain._network._compiled_call_impl is None
+    with torch.compiler.set_stance("force_eager"):
+        assert torch.equal(compiled(photos(1)), plain(photos(1)))
+
+
+def test_photos_are_left_as_they_are(folder):
+    images = photos(1)
+    before = images.clone()
+    load_depth(folder).with_mirrored(images)
+    assert torch.equal(images, before)
+
+
+def test_a_warm_up_runs_the_network_and_says_what_it_takes(folder):
+    report = load_depth(folder).warm_up((90, 131))
+    assert report.micro_batch == 1 and report.peak_bytes is None and report.seconds > 0
+    assert str(report).startswith(f"depth {folder} at 70x98, torch.float32: micro-batch 1, warm after")
 
 
 def test_a_network_works_in_the_stream(folder, tmp_path):
@@ -59,6 +269,114 @@ def test_a_network_works_in_the_stream(folder, tmp_path):
     assert len(pairs) == 3 and all(pair.confidence.std() > 0 for pair in pairs)
 
 
+def test_a_revision_is_found_in_the_hub_cache_without_network(folder, tmp_path):
+    repository = tmp_path / "hub" / "models--somebody--depth"
+    shutil.copytree(folder, repository / "snapshots" / ("0" * 40))
+    (repository / "refs").mkdir()
+    (repository / "refs" / "v1").write_text("0" * 40)
+    program = (
+        "import torch, zsdata\n"
+        "from zsdata.synthesis.depth.identity import depth_identity\n"
+        "from zsdata.synthesis.depth.options import DepthNetwork\n"
+        'network = DepthNetwork("somebody/depth", "native", revision="v1")\n'
+        "assert zsdata.load_depth(network)(torch.rand(1, 3, 28, 42) * 255).shape == (1, 1, 28, 42)\n"
+        f'assert depth_identity(network) == "hub somebody/depth {"0" * 40} 2 resolution=native"\n'
+        "try:\n"
+        '    zsdata.load_depth("somebody/depth")\n'
+        "except OSError as error:\n"
+        "    assert 'depth=\"somebody/depth\" cannot be loaded' in str(error)\n"
+        "else:\n"
+        "    raise AssertionError\n"
+    )
+    offline = {**os.environ, "HF_HOME": str(tmp_path), "HF_HUB_CACHE": str(tmp_path / "hub"), "HF_HUB_OFFLINE": "1"}
+    result = subprocess.run([sys.executable, "-c", program], env=offline, capture_output=True, text=True, timeout=120)
+    assert result.returncode == 0, result.stderr
+
+
+def test_the_cache_tells_options_apart(folder):
+    plain, native, half = (depth_identity(DepthNetwork(str(folder), **o)) for o in ({}, {"resolution": "native"}, {"dtype": "bf16"}))
+    assert plain == depth_identity(folder) and len({plain, native, half}) == 3
+    assert depth_identity(DepthNetwork(str(folder), compile=True, micro_batch=2)) == plain
+
+
+def test_what_is_predicted_is_told_by_the_configuration_or_by_the_user(folder):
+    unknown = types.SimpleNamespace(model_type="newest")
+    with pytest.raises(ValueError, match=r'is a newest network.*DepthNetwork\("somebody/depth", predicts="depth"\)'):
+        _predicts("somebody/depth", unknown)
+    images = photos(1, 70, 98)
+    near, deep = (load_depth(folder, predicts=said)(images) for said in ("inverse depth", "depth"))
+    assert torch.equal(near, load_depth(folder)(images))
+    assert torch.allclose(deep, 1 / near.clamp(min=SMALLEST_DEPTH_M))
+
+
+def test_missing_weights_are_named(copy):
+    path = copy / "model.safetensors"
+    weights = load_file(path)
+    gone = next(name for name in sorted(weights) if name.startswith("head"))
+    del weights[gone]
+    save_file(weights, path, metadata={"format": "pt"})
+    with pytest.raises(ValueError, match=f'lacks 1 weights, "{gone}" for one'):
+        load_depth(copy)
+
+
+def test_weights_that_nothing_uses_may_be_missing(copy):
+    """Published MiDaS networks lack the first fusion stage's first residual unit."""
+    expected, path = load_depth(copy)(photos(1)), copy / "model.safetensors"
+    weights = load_file(path)
+    kept = {name: value for name, value in weights.items() if "fusion_stage.layers.0.residual_layer1." not in name}
+    assert len(kept) < len(weights)
+    save_file(kept, path, metadata={"format": "pt"})
+    assert torch.equal(load_depth(copy)(photos(1)), expected)
+
+
+def test_an_unknown_image_processor_is_named(copy):
+    change(copy, "preprocessor_config.json", image_processor_type="NewImageProcessor")
+    with pytest.raises(ValueError, match="wants its photos prepared by NewImageProcessor; known are those of DPT, DepthPro"):
+        load_depth(copy)
+    change(copy, "preprocessor_config.json", image_processor_type="DPTImageProcessor", resample=1)
+    with pytest.raises(ValueError, match="resizes photos by method 1"):
+        load_depth(copy)
+
+
+def test_what_a_folder_leaves_out_is_what_transformers_would_do(copy):
+    (copy / "preprocessor_config.json").write_text('{"image_processor_type": "DPTFeatureExtractor"}')
+    prepared = load_preprocessing(DepthNetwork(str(copy)))
+    assert (prepared.short_side_px, prepared.multiple_px, prepared.mean, prepared.mode) == (384, 14, (0.5, 0.5, 0.5), "bicubic")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"resolution": 0}, 'resolution is the short side in pixels, "native" or None; got 0'),
+        ({"resolution": "full"}, "got 'full'"),
+        ({"predicts": "disparity"}, "predicts is one of"),
+        ({"dtype": "int8"}, "got int8"),
+        ({"micro_batch": 0}, "micro_batch is 1 or more; got 0"),
+    ],
+)
+def test_bad_options_are_refused(folder, options, message):
+    with pytest.raises(ValueError, match=message):
+        load_depth(folder, **options)
+
+
+def test_options_for_what_takes_none_are_refused(folder):
+    for estimator in ("builtin", lambda images: images[:, :1], DepthNetwork(str(folder))):
+        with pytest.raises(TypeError, match="resolution"):
+            load_depth(estimator, resolution=70)
+
+
+def test_a_missing_package_is_named_with_its_cure(folder, monkeypatch):
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with pytest.raises(ImportError, match=r'pip install "zsdata\[depth\]"'):
+        load_depth(folder)
+
+
 def test_a_name_that_is_nowhere_is_said(tmp_path):
     with pytest.raises(OSError, match="nowhere"):
         load_depth(tmp_path / "nowhere")
+
+
+def test_no_global_random_number_is_drawn(folder):
+    before = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
+    load_depth(Path(folder))(photos(1))
+    assert torch.equal(torch.get_rng_state(), before[0]) and np.array_equal(np.random.get_state()[1], before[1])  # noqa: NPY002

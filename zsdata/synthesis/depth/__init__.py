@@ -2,33 +2,56 @@
 
 A depth estimator is anything that maps images, float32 [B, 3, H, W] RGB 0..255, to inverse depth, float32 [B, 1, H, W], larger is nearer,
 in any scale and offset. It is normalised per photo afterwards.
+
+One that has more to offer is asked for it: `with_mirrored(images) -> (inverse_depth, mirrored)` estimates photo and mirrored photo
+together; `prepare` and `predict_mirrored` let its two halves run in two places; `warm_up(size)` makes it ready and says what memory it
+takes (see `PretrainedDepth`).
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from zsdata.synthesis.depth.options import DepthNetwork
+
 DepthEstimator = Callable[[Tensor], Tensor]
 
 
-def load_depth(depth: str | os.PathLike[str] | DepthEstimator, device: str | torch.device = "cpu") -> DepthEstimator:
+def load_depth(
+    depth: str | os.PathLike[str] | DepthNetwork | DepthEstimator, device: str | torch.device = "cpu", **options: Any
+) -> DepthEstimator:
     """Turns the stream's `depth` argument into a callable `depth(images) -> inverse_depth`.
 
     Args:
-        depth: "builtin"; a Hub id or a local folder in the transformers format (needs the "depth" extra); or a callable, returned as it is.
+        depth: "builtin"; a Hub id or a local folder in the transformers format (needs the "depth" extra), or a `DepthNetwork` with
+            options; or a callable, returned as it is.
         device: where a network is put; the built-in estimator follows its input.
+        options: of a network given by name, those of `DepthNetwork`: `resolution`, `revision`, `dtype`, ...
+
+    Raises:
+        TypeError: options for something that takes none.
     """
-    if callable(depth):
+    if isinstance(depth, DepthNetwork):
+        if options:
+            raise TypeError(f"a DepthNetwork has its options already; got {sorted(options)} beside it")
+        network = depth
+    elif callable(depth):
+        if options:
+            raise TypeError(f"a callable estimator takes no options; got {sorted(options)}")
         return depth
-    name = os.fspath(depth)
-    if name == "builtin":
+    elif os.fspath(depth) == "builtin":
+        if options:
+            raise TypeError(f'depth="builtin" takes no options; got {sorted(options)}')
         from zsdata.synthesis.depth.builtin import BuiltinDepth
 
         return BuiltinDepth()
+    else:
+        network = DepthNetwork(os.fspath(depth), **options)
     from zsdata.synthesis.depth.pretrained import PretrainedDepth
 
-    return PretrainedDepth(name, device)
+    return PretrainedDepth(network, device)

@@ -9,8 +9,10 @@ from typing import Any
 
 from huggingface_hub import try_to_load_from_cache
 
+from zsdata.synthesis.depth.options import DepthNetwork
+
 BUILTIN_VERSION = 1  # raised when the built-in estimator's output changes
-PRETRAINED_VERSION = 1  # raised when pretrained.py does something else before or after the network
+PRETRAINED_VERSION = 2  # raised when pretrained.py does something else before or after the network
 
 CONFIG_NAMES = ("config.json", "preprocessor_config.json")
 WEIGHT_MARKS = (".safetensors", ".bin")  # part of the name of a file of weights, or of its index
@@ -18,7 +20,7 @@ SAMPLES = 16  # places at which a file of weights is read: unpacking and copying
 SAMPLE_BYTES = 4096
 
 
-def depth_identity(depth: str | os.PathLike[str] | Callable[..., Any]) -> str:
+def depth_identity(depth: str | os.PathLike[str] | DepthNetwork | Callable[..., Any]) -> str:
     """A readable string that changes whenever the output of a depth estimator may change, for the `identity` of a `DepthCache`.
 
     It depends on the estimator alone: not on the machine, the versions of the libraries, or what is computed from its output.
@@ -29,6 +31,7 @@ def depth_identity(depth: str | os.PathLike[str] | Callable[..., Any]) -> str:
       copy with new times counts as another estimator, and depth is estimated anew.
     - A Hub id: the id, and the commit that it stands for in the local Hub cache. Nothing is downloaded: an id that is not there yet is an
       error, because maps of an unknown commit could not be told from those of the next one.
+    - A `DepthNetwork`: its folder or Hub id, and the options that change its output.
     - A callable: its attribute `cache_name`, which whoever changes the callable also changes. No name is guessed: code and weights of a
       callable cannot be seen from outside, and wrong depth would come out of the cache without a word.
 
@@ -36,6 +39,10 @@ def depth_identity(depth: str | os.PathLike[str] | Callable[..., Any]) -> str:
         FileNotFoundError: a Hub id that is not in the local Hub cache, or a folder without config.json.
         ValueError: a callable without `cache_name`, or a string that is neither a folder nor a Hub id.
     """
+    if isinstance(depth, DepthNetwork):
+        options = {"resolution": depth.resolution, "predicts": depth.predicts, "dtype": depth.dtype}
+        said = "".join(f" {option}={value}" for option, value in options.items() if value is not None)
+        return f"{_name_identity(depth.name, depth.revision)}{said}"
     if callable(depth):
         name = getattr(depth, "cache_name", None)
         if not isinstance(name, str) or not name.strip():
@@ -45,23 +52,26 @@ def depth_identity(depth: str | os.PathLike[str] | Callable[..., Any]) -> str:
             )
         return f"callable {name}"
     name = os.fspath(depth)
-    if name == "builtin":
-        return f"builtin {BUILTIN_VERSION}"
+    return f"builtin {BUILTIN_VERSION}" if name == "builtin" else _name_identity(name, None)
+
+
+def _name_identity(name: str, revision: str | None) -> str:
     if os.path.isdir(name):
         return f"folder {os.path.basename(os.path.realpath(name))} {_folder_digest(name)} {PRETRAINED_VERSION}"
-    return f"hub {name} {hub_commit(name)} {PRETRAINED_VERSION}"
+    return f"hub {name} {hub_commit(name, revision)} {PRETRAINED_VERSION}"
 
 
-def hub_commit(name: str) -> str:
-    """The commit of a Hub id (its branch "main") in the local Hub cache; see `depth_identity` for the errors."""
+def hub_commit(name: str, revision: str | None = None) -> str:
+    """The commit of a Hub id's revision (None: its branch "main") in the local Hub cache; see `depth_identity` for the errors."""
     try:
-        config = try_to_load_from_cache(name, "config.json")
+        config = try_to_load_from_cache(name, "config.json", revision=revision)
     except ValueError as error:
         raise ValueError(f'depth="{name}" is neither a folder nor a Hub id ("owner/name"): {error}') from error
     if not isinstance(config, str):
+        wanted = "" if revision is None else f', revision="{revision}"'
         raise FileNotFoundError(
             f'depth="{name}" is no folder, and the local Hub cache does not have it: depth_cache needs to know its commit. '
-            f"Download it first: python -c 'import zsdata; zsdata.load_depth(\"{name}\")'"
+            f"Download it first: python -c 'import zsdata; zsdata.load_depth(\"{name}\"{wanted})'"
         )
     return os.path.basename(os.path.dirname(config))
 

@@ -1,57 +1,126 @@
-"""Depth from a network in the transformers format: Depth Anything V2 and its relatives."""
+"""Depth from a network in the transformers format: Depth Anything V2 and its relatives.
+
+The work has two halves that may run in two places: `prepare` resizes a photo on the CPU, `predict` runs the network on its device.
+"""
 
 from __future__ import annotations
 
 import json
+import re
+from collections import defaultdict
+from collections.abc import Sequence
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-# Networks that predict metric depth, whatever their configuration says; all others predict inverse depth unless it says "metric".
-METRIC_DEPTH_MODELS = ("depth_pro", "glpn", "zoedepth")
+from zsdata.synthesis.depth.options import DepthNetwork
+from zsdata.synthesis.depth.preprocessing import Preprocessing, read_preprocessing
+from zsdata.synthesis.micro_batch import MicroBatch, WarmUp, measure, weight_bytes
+from zsdata.synthesis.precision import choose_dtype
+
+# What a network's prediction is, by the model_type of its configuration. Depth Pro's is inverse depth: transformers inverts it afterwards.
+INVERSE_DEPTH_MODELS = ("depth_pro",)
+DEPTH_MODELS = ("glpn", "tipsv2_dpt", "zoedepth")
+METRIC_DPT_BACKBONES = ("dinov2", "dinov2_with_registers")  # DPT heads on DINOv2 predict metres (NYU, KITTI); MiDaS's predict inverse depth
+
 SMALLEST_DEPTH_M = 1e-3
+LAST_LAYERS = ("head", "relative_head", "metric_head")  # names that transformers' depth networks give them
+# DPT networks have these weights, published checkpoints do not, and nothing uses them: the first stage fuses nothing.
+NEVER_USED = re.compile(r"fusion_stage\.layers\.0\.residual_layer1\.")
 
 
 class PretrainedDepth:
     """A depth-estimation network of transformers, with the pre-processing that its folder states.
 
-    Photos are resized so that their short side is the network's own input size, keeping the aspect, to whole patches; normalised; and the
-    prediction is brought back to the photo's size. Metric depth is inverted.
+    Photos are resized so that their short side has the network's own length (or the one asked for), keeping the aspect, to whole patches;
+    normalised; and the prediction is brought back to the photo's size. Depth is inverted. On the CPU a photo's result is the same bit for
+    bit whatever it is estimated with; on a GPU up to rounding.
 
     Args:
-        name: a Hub id, such as "depth-anything/Depth-Anything-V2-Small-hf" (Apache-2.0), or a local folder.
+        network: which one, and how it is run.
         device: where the network is put.
 
     Raises:
         ImportError: transformers is not installed.
         OSError: nothing is found under that name.
+        ValueError: weights are missing, or it is not known how photos are prepared for this kind of network or what it predicts.
     """
 
-    def __init__(self, name: str, device: str | torch.device = "cpu") -> None:
-        try:
-            from transformers import AutoModelForDepthEstimation
-            from transformers.utils.hub import cached_file
-        except ImportError as error:
-            raise ImportError(f'depth="{name}" needs transformers: pip install "zsdata[depth]"') from error
-        self._network = AutoModelForDepthEstimation.from_pretrained(name).to(device).eval().requires_grad_(False)
-        with open(str(cached_file(name, "preprocessor_config.json")), encoding="utf-8") as file:
-            preprocessing: dict[str, Any] = json.load(file)
-        size = preprocessing.get("size", 518)
-        self._short_side_px = int(size if isinstance(size, int) else min(size.values()))
-        config = self._network.config
-        backbone = getattr(config, "backbone_config", None)
-        self._multiple_px = int(
-            preprocessing.get("ensure_multiple_of") or getattr(config, "patch_size", None) or getattr(backbone, "patch_size", None) or 32
+    def __init__(self, network: DepthNetwork, device: str | torch.device = "cpu") -> None:
+        name = network.name
+        self.network, self.device = network, torch.device(device)
+        self.dtype = choose_dtype(network.dtype, self.device)
+        self.preprocessing = load_preprocessing(network)
+        from transformers import AutoModelForDepthEstimation
+
+        loaded, report = AutoModelForDepthEstimation.from_pretrained(name, revision=network.revision, output_loading_info=True)
+        missing = sorted(key for key in report["missing_keys"] if not NEVER_USED.search(key))
+        if missing:
+            raise ValueError(f'depth="{name}" lacks {len(missing)} weights, "{missing[0]}" for one; download it again')
+        self._predicts_depth = (network.predicts or _predicts(name, loaded.config)) == "depth"
+        self._network: Any = loaded.to(self.device).eval().requires_grad_(False)
+        if self.device.type == "cuda":
+            self._network.to(memory_format=torch.channels_last)
+        if self.dtype != torch.float32:
+            for layers in filter(None, (getattr(loaded, attribute, None) for attribute in LAST_LAYERS)):
+                _keep_in_float32(layers, self.device.type)
+        if network.compile:
+            self._network.compile()
+        self.micro_batch = MicroBatch(
+            "depth network", network.micro_batch, self.device, "lower resolution, or take a smaller network or dtype"
         )
-        self._mean = torch.tensor(preprocessing.get("image_mean", [0.485, 0.456, 0.406]), device=device).view(1, 3, 1, 1)
-        self._std = torch.tensor(preprocessing.get("image_std", [0.229, 0.224, 0.225]), device=device).view(1, 3, 1, 1)
-        self._metric = config.model_type in METRIC_DEPTH_MODELS or getattr(config, "depth_estimation_type", "relative") == "metric"
+
+    def prepare(self, images: Tensor) -> Tensor:
+        """The first half: photos to the network's input.
+
+        Args:
+            images: uint8, or float in 0..255 (rounded to whole numbers first), [B, 3, H, W], RGB.
+
+        Returns:
+            uint8 [B, 3, h, w], small to send to another process. For the mirrored photo it is the mirror image.
+        """
+        return self.preprocessing.prepare(images)
 
     @torch.inference_mode()
+    def predict(self, inputs: Sequence[Tensor], sizes: Sequence[tuple[int, int]]) -> list[Tensor]:
+        """The second half: inverse depth of prepared photos; those of one input size share micro-batches.
+
+        Args:
+            inputs: of each photo what `prepare` made of it, uint8 [1, 3, h, w], on any device.
+            sizes: (height, width) of each photo.
+
+        Returns:
+            One float32 [1, 1, H, W] per photo, larger is nearer, on the network's device.
+
+        Raises:
+            MemoryError: the device has not enough memory for one photo.
+        """
+        if len(inputs) != len(sizes):
+            raise ValueError(f"one size per photo: {len(inputs)} inputs, {len(sizes)} sizes")
+        alike: dict[tuple[int, ...], list[int]] = defaultdict(list)
+        for place, prepared in enumerate(inputs):
+            alike[tuple(prepared.shape)].append(place)
+        made: dict[int, Tensor] = {}
+        for places in alike.values():
+            together = torch.cat([inputs[place].to(self.device, non_blocking=True) for place in places])
+            predicted = torch.cat(self.micro_batch.run(lambda part, together=together: self._run(together[part]), len(places)))
+            for place, one in zip(places, predicted.split(1), strict=True):
+                made[place] = self.preprocessing.restore(one, sizes[place])
+        return [made[place] for place in range(len(inputs))]
+
+    def predict_mirrored(self, inputs: Sequence[Tensor], sizes: Sequence[tuple[int, int]]) -> list[tuple[Tensor, Tensor]]:
+        """As `predict`, of every photo and of its mirror image, in the same micro-batches.
+
+        Returns:
+            Per photo its inverse depth and that of its mirror image, mirrored back: two float32 [1, 1, H, W].
+        """
+        both = [image for prepared in inputs for image in (prepared, prepared.flip(-1))]
+        made = self.predict(both, [size for size in sizes for _ in range(2)])
+        return [(one, mirrored.flip(-1)) for one, mirrored in zip(made[::2], made[1::2], strict=True)]
+
     def __call__(self, images: Tensor) -> Tensor:
-        """Inverse depth of `images`.
+        """Inverse depth of `images`: both halves.
 
         Args:
             images: float32 [B, 3, H, W], RGB 0..255.
@@ -59,11 +128,80 @@ class PretrainedDepth:
         Returns:
             float32 [B, 1, H, W], larger is nearer, on the device of `images`.
         """
-        height, width = images.shape[-2:]
-        scale = self._short_side_px / min(height, width)
-        size = [max(1, round(side * scale / self._multiple_px)) * self._multiple_px for side in (height, width)]
-        pixels = F.interpolate(images.to(self._mean.device), size, mode="bicubic", antialias=True, align_corners=False).clamp(0, 255)
-        predicted = self._network(pixel_values=(pixels / 255 - self._mean) / self._std).predicted_depth.unsqueeze(1).float()
-        if self._metric:
-            predicted = 1 / predicted.clamp(min=SMALLEST_DEPTH_M)
-        return F.interpolate(predicted, (height, width), mode="bilinear", align_corners=False).to(images.device)
+        sizes = [(images.shape[-2], images.shape[-1])] * len(images)
+        return torch.cat(self.predict(self.prepare(images).split(1), sizes)).to(images.device)
+
+    def with_mirrored(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Inverse depth of `images` and of their mirror images, mirrored back, each as `__call__` returns it."""
+        sizes = [(images.shape[-2], images.shape[-1])] * len(images)
+        made = self.predict_mirrored(self.prepare(images).split(1), sizes)
+        depth, mirrored = (torch.cat(maps).to(images.device) for maps in zip(*made, strict=True))
+        return depth, mirrored
+
+    def warm_up(self, size: tuple[int, int]) -> WarmUp:
+        """Runs one whole micro-batch of grey photos of this (height, width), and says how much memory that takes."""
+        inputs = [self.prepare(torch.full((1, 3, *size), 127, dtype=torch.uint8))] * self.micro_batch.size
+        peak, seconds = measure(lambda: self.predict(inputs, [size] * len(inputs)), self.device)
+        what = f"depth {self.network.name} at {inputs[0].shape[-2]}x{inputs[0].shape[-1]}, {self.dtype}"
+        return WarmUp(what, self.micro_batch.size, None if peak is None else peak + weight_bytes(self._network), seconds)
+
+    def _run(self, inputs: Tensor) -> Tensor:
+        """uint8 [B, 3, h, w] on the device to inverse depth, float32 [B, 1, h', w']."""
+        with torch.autocast(self.device.type, self.dtype, enabled=self.dtype != torch.float32):
+            predicted = self._network(pixel_values=self.preprocessing.normalise(inputs)).predicted_depth.unsqueeze(1).float()
+        return 1 / predicted.clamp(min=SMALLEST_DEPTH_M) if self._predicts_depth else predicted
+
+
+def load_preprocessing(network: DepthNetwork) -> Preprocessing:
+    """How photos are prepared for a network: a few numbers that travel anywhere, read without loading the network's weights.
+
+    Raises:
+        ImportError, OSError, ValueError: as `PretrainedDepth`.
+    """
+    try:
+        from transformers import AutoConfig
+        from transformers.utils.hub import cached_file
+    except ImportError as error:
+        raise ImportError(f'depth="{network.name}" needs transformers: pip install "zsdata[depth]"') from error
+    try:
+        config = AutoConfig.from_pretrained(network.name, revision=network.revision)
+        path = cached_file(network.name, "preprocessor_config.json", revision=network.revision)
+    except OSError as error:
+        which = "" if network.revision is None else f', revision "{network.revision}",'
+        raise OSError(f'depth="{network.name}"{which} cannot be loaded: {error}') from error
+    with open(str(path), encoding="utf-8") as file:
+        return read_preprocessing(network.name, json.load(file), config, network.resolution)
+
+
+def _predicts(name: str, config: Any) -> str:
+    kind = config.model_type
+    if kind in DEPTH_MODELS or getattr(config, "depth_estimation_type", "relative") == "metric":
+        return "depth"
+    if kind == "dpt":
+        backbone = getattr(getattr(config, "backbone_config", None), "model_type", None)
+        return "depth" if backbone in METRIC_DPT_BACKBONES else "inverse depth"
+    if kind == "depth_anything" or kind in INVERSE_DEPTH_MODELS:
+        return "inverse depth"
+    raise ValueError(
+        f'depth="{name}" is a {kind} network, of which it is not known whether it predicts depth or inverse depth; say so: '
+        f'DepthNetwork("{name}", predicts="depth") or predicts="inverse depth"'
+    )
+
+
+def _keep_in_float32(layers: torch.nn.Module, device_type: str) -> None:
+    """Lets no autocast into these layers. What they return is depth: bfloat16 would leave 256 steps of it between 1 and 2."""
+    forward = layers.forward
+
+    def in_float32(*inputs: Any) -> Any:
+        with torch.autocast(device_type, enabled=False):
+            return forward(*(_to_float32(value) for value in inputs))
+
+    layers.forward = in_float32
+
+
+def _to_float32(value: Any) -> Any:
+    if isinstance(value, Tensor) and value.is_floating_point():
+        return value.float()
+    if isinstance(value, list | tuple):
+        return type(value)(_to_float32(item) for item in value)
+    return value

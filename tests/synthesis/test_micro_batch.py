@@ -1,0 +1,93 @@
+"""How many samples at once: as many as fit, found without failing, lowered where memory runs out after all."""
+
+import logging
+from itertools import chain
+
+import pytest
+import torch
+
+from zsdata.synthesis.micro_batch import GIB, MicroBatch, WarmUp, largest_micro_batch, measure, weight_bytes
+
+GPU = torch.device("meta")  # a device that is not the CPU and is everywhere
+
+
+def limited(most, seen):
+    def work(part):
+        size = part.stop - part.start
+        seen.append(size)
+        if size > most:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        return list(range(part.start, part.stop))
+
+    return work
+
+
+def joined(parts):
+    return list(chain.from_iterable(parts))
+
+
+def test_parts_cover_all_samples_in_order():
+    batch, seen = MicroBatch("network", 3, GPU, "cure"), []
+    assert joined(batch.run(limited(3, seen), 8)) == list(range(8)) and seen == [3, 3, 2]
+    assert batch.run(limited(3, seen), 0) == []
+
+
+def test_on_the_cpu_it_is_one():
+    assert MicroBatch("network", 8, torch.device("cpu"), "cure").size == 1
+
+
+def test_what_does_not_fit_is_halved_for_the_rest_of_the_run_and_said_once(caplog):
+    batch, seen = MicroBatch("network", 8, GPU, "cure"), []
+    with caplog.at_level(logging.WARNING, "zsdata"):
+        assert joined(batch.run(limited(3, seen), 9)) == list(range(9))
+        assert seen == [8, 4, 2, 2, 2, 2, 1] and (batch.size, batch.lowered) == (2, 2)
+        seen.clear()
+        batch.run(limited(3, seen), 4)
+    assert seen == [2, 2] and len(caplog.records) == 2
+    assert "with 8 samples at once; from now on it takes 4" in caplog.text and "set micro_batch=2" in caplog.text
+
+
+def test_the_last_smaller_part_is_halved_by_its_own_size():
+    batch = MicroBatch("network", 8, GPU, "cure")
+    batch.run(limited(1, []), 3)
+    assert batch.size == 1
+
+
+def test_one_sample_that_does_not_fit_is_an_error_with_the_cure():
+    with pytest.raises(MemoryError, match=r"not enough memory for one sample \(network\): take less") as raised:
+        MicroBatch("network", 8, GPU, "take less").run(limited(0, []), 8)
+    assert isinstance(raised.value.__cause__, torch.OutOfMemoryError)
+
+
+@pytest.mark.parametrize(
+    ("budget", "most", "expected"),
+    [(0, 16, 1), (119, 16, 1), (239, 16, 1), (240, 16, 2), (419, 16, 2), (420, 16, 4), (10_000, 16, 16), (10_000, 6, 4)],
+)
+def test_the_largest_power_of_two_within_the_budget_is_found_without_exceeding_it(budget, most, expected):
+    seen = []
+    assert largest_micro_batch(lambda size: seen.append(size) or 20 + 100 * size, budget, most) == expected
+    assert all(20 + 100 * size <= max(budget, 120) for size in seen)
+
+
+def test_work_whose_need_levels_off_gets_the_largest():
+    """An autoencoder that takes at most four images at once stops growing."""
+    assert largest_micro_batch(lambda size: 100 * min(size, 4) + size, 1000) == 16
+
+
+def test_work_that_needs_more_than_foretold_stays_where_it_fits():
+    assert largest_micro_batch(lambda size: size**2, 40) == 4
+
+
+def test_a_warm_up_can_be_read():
+    assert str(WarmUp("unet at 384x512", 8, 3 * GIB // 2, 2.34)) == "unet at 384x512: micro-batch 8, peak memory 1.50 GiB, warm after 2.3 s"
+
+
+def test_the_cpu_counts_no_memory():
+    peak, seconds = measure(lambda: None, torch.device("cpu"))
+    assert peak is None and seconds >= 0
+
+
+def test_weights_are_counted_in_their_own_format():
+    network = torch.nn.BatchNorm1d(10)
+    assert weight_bytes(network) == 4 * 40 + 8
+    assert weight_bytes(network.half(), torch.nn.Linear(3, 2, bias=False)) == 4 * 20 + 8 + 24

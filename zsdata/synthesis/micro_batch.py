@@ -1,0 +1,143 @@
+"""Micro-batches: how many samples go through a network at once, chosen by memory and lowered where memory runs out.
+
+On the CPU it is always one: in a batch the order of sums, and with it the last bits of a sample, would depend on the samples beside it.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+import torch
+
+logger = logging.getLogger("zsdata")
+
+LARGEST_AUTO = 16  # a GPU is busy long before; more only takes memory
+AUTO_SHARE = 0.5  # of the memory that is free at warm-up; the rest is the matcher's, which has not taken its own yet
+GIB = 2**30
+
+Made = TypeVar("Made")
+
+
+class WarmUp(NamedTuple):
+    """What was found before the first real batch.
+
+    Attributes:
+        what: the network and the size that it was tried at.
+        micro_batch: samples that go through it at once.
+        peak_bytes: the most device memory that weights and activations take together; None where the device does not count it (the CPU).
+        seconds: how long the warm-up took.
+    """
+
+    what: str
+    micro_batch: int
+    peak_bytes: int | None
+    seconds: float
+
+    def __str__(self) -> str:
+        peak = "" if self.peak_bytes is None else f", peak memory {self.peak_bytes / GIB:.2f} GiB"
+        return f"{self.what}: micro-batch {self.micro_batch}{peak}, warm after {self.seconds:.1f} s"
+
+
+class MicroBatch:
+    """Runs work over many samples in parts; a part that does not fit into memory makes all later parts smaller.
+
+    Args:
+        what: for messages, such as "depth network".
+        size: samples at once, 1 or more; on the CPU 1 is used instead.
+        device: where the work is done.
+        cure: ends the sentence "...: " in the error that is raised when one sample alone does not fit.
+
+    `size` is what is used now; `lowered` counts how often memory ran out.
+    """
+
+    def __init__(self, what: str, size: int, device: torch.device, cure: str) -> None:
+        self.what, self.cure, self.device = what, cure, device
+        self.size = 1 if device.type == "cpu" else size
+        self.lowered = 0
+
+    def run(self, work: Callable[[slice], Made], total: int) -> list[Made]:
+        """`work(part)` for parts of at most `size` that cover range(total), in order.
+
+        Raises:
+            MemoryError: a single sample does not fit.
+        """
+        made: list[Made] = []
+        start = 0
+        while start < total:
+            stop = min(start + self.size, total)
+            try:
+                made.append(work(slice(start, stop)))
+            except torch.OutOfMemoryError as error:
+                self._lower(stop - start, error)
+                continue
+            start = stop
+        return made
+
+    def _lower(self, tried: int, error: torch.OutOfMemoryError) -> None:
+        self.lowered += 1
+        if tried == 1:
+            raise MemoryError(f"{self.device} has not enough memory for one sample ({self.what}): {self.cure}") from error
+        self.size = tried // 2
+        logger.warning(
+            "%s ran out of memory (%s) with %d samples at once; from now on it takes %d, and nothing else changes. "
+            "To avoid it, set micro_batch=%d",
+            self.device,
+            self.what,
+            tried,
+            self.size,
+            self.size,
+        )
+        if self.device.type == "cuda":
+            torch.cuda.empty_cache()
+
+
+def largest_micro_batch(peak_bytes: Callable[[int], int], budget_bytes: int, most: int = LARGEST_AUTO) -> int:
+    """The largest power of two, at most `most`, whose work takes at most `budget_bytes`; 1 where not even 1 does.
+
+    Sizes are doubled, and one is tried only where the two before it foretell that it fits, so that nothing fails on the way. The second
+    size has no two before it: it is tried where twice the first fits.
+
+    Args:
+        peak_bytes: runs the work for so many samples and says how much memory it took.
+        budget_bytes: how much it may take.
+        most: the largest size that is wanted.
+    """
+    size, slope = 1, None
+    peak = peak_bytes(size)
+    while 2 * size <= most:
+        foretold = peak + size * (peak if slope is None else slope)
+        if foretold > budget_bytes:
+            break
+        doubled = peak_bytes(2 * size)
+        if doubled > budget_bytes:
+            break
+        size, slope, peak = 2 * size, (doubled - peak) / size, doubled
+    return size
+
+
+def measure(work: Callable[[], object], device: torch.device) -> tuple[int | None, float]:
+    """Bytes of device memory that `work` takes at its peak beyond what is taken already (None on the CPU), and its seconds."""
+    start = time.perf_counter()
+    if device.type != "cuda":
+        work()
+        return None, time.perf_counter() - start
+    torch.cuda.synchronize(device)
+    before = torch.cuda.memory_allocated(device)
+    torch.cuda.reset_peak_memory_stats(device)
+    work()
+    torch.cuda.synchronize(device)
+    return torch.cuda.max_memory_allocated(device) - before, time.perf_counter() - start
+
+
+def free_bytes(device: torch.device) -> int:
+    """Memory of a CUDA device that can still be taken: what no process has, and what torch holds without using it."""
+    free, _ = torch.cuda.mem_get_info(device)
+    return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+
+
+def weight_bytes(*networks: torch.nn.Module) -> int:
+    """Memory of all parameters and buffers."""
+    return sum(tensor.numel() * tensor.element_size() for network in networks for tensor in (*network.parameters(), *network.buffers()))
