@@ -447,3 +447,58 @@ def test_photos_decoded_at_a_fraction_give_the_same_pairs_with_and_without_a_dep
     plain = by_index(open_stream(tar, **options))
     for _ in range(2):
         assert by_index(open_stream(tar, depth_cache=tmp_path / "depth", **options)) == plain
+
+
+def pixels_of(pair: StereoBatch):
+    return torch.cat([pair.left_clean, pair.right_clean, pair.disparity, pair.confidence, *pair.masks])
+
+
+class CountingFill:
+    """An inpainter that counts the pairs it fills."""
+
+    def __init__(self):
+        self.pairs = 0
+
+    def __call__(self, right, inpaint_mask, generators):
+        self.pairs += len(right)
+        return grey_fill(right, inpaint_mask, generators)
+
+
+@pytest.mark.parametrize("options", [{"reuse": 3}, {"reuse": 2, "views_per_image": 2}], ids=str)
+@pytest.mark.parametrize("batch_size", [4, 6])
+def test_a_reused_pair_is_filled_once_and_augmented_each_time(tar, options, batch_size):
+    reuse, inpaint = options["reuse"], CountingFill()
+    stream = open_stream(tar, inpaint=inpaint, **options)
+    pairs = list(stream)
+    assert len(pairs) == 12 * reuse * options.get("views_per_image", 1) and inpaint.pairs == len(pairs) // reuse
+    for first in range(0, len(pairs), reuse):
+        group = pairs[first : first + reuse]
+        assert all(torch.equal(pixels_of(pair), pixels_of(group[0])) for pair in group)
+        assert len({pair.left.numpy().tobytes() for pair in group}) == reuse
+    inpaint.pairs = 0
+    with stream.loader(batch_size, num_workers=2) as loader:
+        batches = list(loader)
+    made = by_index(batch[i] for batch in batches for i in range(batch_size))
+    assert made == {place: value for place, value in by_index(pairs).items() if place in made}
+    assert len(made) == len(pairs) // batch_size * batch_size and inpaint.pairs == -(-len(made) // reuse)
+    assert fingerprint(stream.replay(0, 4)) == fingerprint(pairs[4])
+
+
+@pytest.mark.parametrize("options", [{}, {"views_per_image": 2}, {"reuse": 2}, {"inpaint": "background"}], ids=str)
+@pytest.mark.parametrize("workers", [0, 2])
+def test_depth_on_the_device_gives_what_the_workers_give(tar, tmp_path, options, workers):
+    plain = by_index(open_stream(tar, depth=CountingDepth(), **options))
+    for cached in ({}, {"depth_cache": tmp_path}, {"depth_cache": tmp_path}):
+        depth = CountingDepth()
+        stream = open_stream(tar, depth=depth, depth_placement="device", **options, **cached)
+        with stream.loader(3, num_workers=workers) as loader:
+            assert by_index(batch[i] for batch in loader for i in range(3)) == plain
+    assert depth.calls == 0, "the second time all depth was in the cache"
+
+
+def test_a_pair_that_is_made_on_the_device_says_which_one_failed(tar):
+    def fails(images):
+        raise ValueError("no depth today")
+
+    with pytest.raises(RuntimeError, match=r"sample \d+ of epoch 0 .*photos.tar.* failed: no depth today"):
+        next(iter(open_stream(tar, depth=fails, depth_placement="device").loader(2)))

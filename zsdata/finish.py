@@ -1,18 +1,64 @@
-"""The finish: what the training device does to a batch that the workers prepared. Holes are filled, then both images are augmented."""
+"""The finish: what the training device does to a batch that the workers prepared. Holes are filled, then both images are augmented.
+
+Where depth is the device's work too, it first makes the pairs: the same functions as in the workers, on the device.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
+from torch import Tensor
 
 from zsdata.augment import AugmentConfig, augment
 from zsdata.meter import Meter
+from zsdata.prepared import Draft, Drafts, Prepared, make
 from zsdata.sample import Masks, StereoBatch
 from zsdata.seeding import rng
+from zsdata.synthesis.depth import DepthEstimator
 from zsdata.synthesis.inpaint import Inpainter, fill
-from zsdata.worker import Prepared, single_thread
+from zsdata.synthesis.synthesizer import DepthMaps, estimate_depth
+from zsdata.worker import Recipe, naming, single_thread, store_depth
+
+
+@dataclass(frozen=True)
+class Synthesis:
+    """Depth and warp on the device: drafts to prepared pairs."""
+
+    depth: DepthEstimator
+    recipe: Recipe
+
+    def __call__(self, drafts: Drafts, device: torch.device, meter: Meter) -> Prepared:
+        """The pairs of a batch of drafts, on the device; a photo's depth is estimated once, however many views of it are in the batch."""
+        pairs: list[Prepared] = []
+        known: dict[tuple[str, str], DepthMaps] = {}
+        for draft in drafts.drafts:
+            with naming(draft.meta):
+                pairs.append(self._make(draft, known, device, meter))
+        made = Prepared.stack(pairs)
+        meta = [{**made.meta[row], "index": sample["index"]} for row, sample in zip(drafts.rows, drafts.meta, strict=True)]
+        return replace(made, meta=meta, rejected=drafts.rejected, seconds=drafts.seconds, rows=drafts.rows)
+
+    def _make(self, draft: Draft, known: dict[tuple[str, str], DepthMaps], device: torch.device, meter: Meter) -> Prepared:
+        photo = (draft.meta["shard"], draft.meta["key"])
+        depth = draft.depth if draft.depth is not None else known.get(photo)
+        if depth is None:
+            with meter.stage("depth"):
+                depth = known[photo] = self._estimate(draft, device)
+        depth = depth._replace(inverse_depth=depth.inverse_depth.to(device), confidence=depth.confidence.to(device))
+        left = draft.left.to(device, non_blocking=True)
+        return make(replace(draft, left=left), depth, self.recipe.inpainter_needs, self.recipe.synthesis, meter)
+
+    def _estimate(self, draft: Draft, device: torch.device) -> DepthMaps:
+        assert draft.photo is not None  # a draft has either
+        with torch.inference_mode():
+            depth = estimate_depth(self.depth, draft.photo.to(device, non_blocking=True).unsqueeze(0).float(), self.recipe.synthesis)
+        if self.recipe.depth_cache is not None:
+            store_depth(self.recipe.depth_cache, draft.digest, depth)
+        return depth
 
 
 @dataclass(frozen=True)
@@ -23,13 +69,19 @@ class Finisher:
     augmentation: AugmentConfig
     micro_batch: int
     device: torch.device
+    synthesis: Synthesis | None = None
+    reuse: int = 1
+    _last: dict[str, Any] = field(default_factory=dict)  # the pair that was filled last: its next sample may begin the next batch
 
     @torch.no_grad()
-    def __call__(self, prepared: Prepared, meter: Meter) -> StereoBatch:
+    def __call__(self, prepared: Prepared | Drafts, meter: Meter) -> StereoBatch:
         """A batch of prepared samples (with a batch axis) to a StereoBatch on the device; its images and labels are new tensors.
 
         On the CPU one thread does it: the workers have the others, and no sum depends on how many there are."""
         with single_thread() if self.device.type == "cpu" else nullcontext():
+            if isinstance(prepared, Drafts):
+                assert self.synthesis is not None  # who asks for drafts says how to make pairs of them
+                prepared = self.synthesis(prepared, self.device, meter)
             return self._finish(prepared, meter)
 
     def _finish(self, prepared: Prepared, meter: Meter) -> StereoBatch:
@@ -46,16 +98,36 @@ class Finisher:
                 )
             )
             context = {name: tensor.to(self.device, non_blocking=True).float() for name, tensor in prepared.context.items()}
-        left_clean = left.float()
         with meter.stage("inpaint"):
-            filled = fill(self.inpainter, right.float(), inpaint, self._generators(prepared, "inpaint"), context, self.micro_batch)
-            width = left.shape[-1]  # the right view reaches further, for the inpainter's sake
-            right_clean, inpaint = filled[..., :width].contiguous(), inpaint[..., :width].contiguous()
+            right = self._fill(right.float(), inpaint, prepared, context)
+        width = left.shape[-1]  # the right view reaches further, for the inpainter's sake
+        rows = prepared.rows
+        left_clean, right_clean, inpaint, disparity, confidence, nonocclusion = (
+            _spread(values[..., :width], rows) for values in (left.float(), right, inpaint, disparity, confidence, nonocclusion)
+        )
         with meter.stage("augment"):
-            left, right = augment(left_clean, right_clean, self._generators(prepared, "augment"), self.augmentation)
+            generators = [rng(meta["seed"], meta["epoch"], meta["index"], "augment") for meta in prepared.meta]
+            left, right = augment(left_clean, right_clean, generators, self.augmentation)
         masks = Masks(nonocclusion, inpaint, valid=disparity > 0)
         return StereoBatch(left, right, disparity, confidence, masks, left_clean, right_clean, prepared.meta)
 
-    @staticmethod
-    def _generators(prepared: Prepared, purpose: str):
-        return [rng(meta["seed"], meta["epoch"], meta["index"], purpose) for meta in prepared.meta]
+    def _fill(self, right: Tensor, inpaint: Tensor, prepared: Prepared, context: dict[str, Tensor]) -> Tensor:
+        """The right views without holes, one for each distinct pair."""
+        metas = [prepared.meta[prepared.rows.index(row)] for row in range(len(right))]
+        pairs = [{**meta, "index": meta["pair"]} for meta in metas]
+        known = 1 if self._last.get("pair") == pairs[0] else 0
+        generators = [rng(meta["seed"], meta["epoch"], meta["pair"], "inpaint") for meta in metas[known:]]
+        context = {name: values[known:] for name, values in context.items()}
+        filled = fill(self.inpainter, right[known:], inpaint[known:], generators, context, self.micro_batch)
+        if known:
+            filled = torch.cat([self._last["right"], filled])
+        if self.reuse > 1:
+            self._last.update(pair=pairs[-1], right=filled[-1:])
+        return filled
+
+
+def _spread(values: Tensor, rows: Sequence[int]) -> Tensor:
+    """One row per sample, in memory of its own."""
+    if list(rows) == list(range(len(values))):
+        return values.contiguous()
+    return values[torch.tensor(rows, device=values.device)].contiguous()

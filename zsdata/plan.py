@@ -62,7 +62,7 @@ class EpochPlan:
     """The order of photos while one set of sources is in use.
 
     Every source gives a fixed number of photos per epoch (its `quota`) and goes through all its photos before it repeats one; the
-    sources are mixed by one permutation of the epoch. Samples k i to k i + k - 1 are the k views of one photo, so that whoever makes them
+    sources are mixed by one permutation of the epoch. Samples k i to k i + k - 1 are made from one photo, so that whoever makes them
     one after another decodes it once.
 
     Args:
@@ -70,27 +70,27 @@ class EpochPlan:
         names: of the sources; a source keeps its order whatever stands beside it.
         sizes: photos per source.
         quotas: photos per source and epoch.
-        views_per_image: k.
-        samples: per epoch, where the last photo gives fewer views than the others.
+        samples_per_photo: k.
+        samples: per epoch, where the last photo gives fewer than the others.
     """
 
     seed: int
     names: tuple[str, ...]
     sizes: tuple[int, ...]
     quotas: tuple[int, ...]
-    views_per_image: int = 1
+    samples_per_photo: int = 1
     samples: int | None = None
 
     @property
     def epoch_size(self) -> int:
         """Samples per epoch."""
-        return self.samples if self.samples is not None else sum(self.quotas) * self.views_per_image
+        return self.samples if self.samples is not None else sum(self.quotas) * self.samples_per_photo
 
     def choose(self, epoch: int, index: int) -> Choice:
         """The photo of sample `index` of `epoch`."""
         if not 0 <= index < self.epoch_size:
             raise IndexError(f"sample {index} of an epoch of {self.epoch_size}")
-        place = Shuffle(sum(self.quotas), self.seed, "mix", epoch)(index // self.views_per_image)
+        place = Shuffle(sum(self.quotas), self.seed, "mix", epoch)(index // self.samples_per_photo)
         ends = list(accumulate(self.quotas))
         source = bisect_right(ends, place)
         turn = epoch * self.quotas[source] + place - (ends[source] - self.quotas[source])
@@ -105,7 +105,7 @@ class EpochPlan:
         others = self.sizes[chosen.source] - 1
         if attempt >= others:
             return None
-        other = Shuffle(others, self.seed, "spare", epoch, index // self.views_per_image)(attempt)
+        other = Shuffle(others, self.seed, "spare", epoch, index // self.samples_per_photo)(attempt)
         return Choice(chosen.source, other + (other >= chosen.member))
 
 

@@ -45,17 +45,16 @@ class Schedule:
 
     Args:
         sources: as `ZeroStereoStream` takes them: urls, a list of urls, {name: ImageSource or urls}, or {first epoch: any of these}.
-        seed, epoch_size, views_per_image: as `ZeroStereoStream` takes them.
+        seed, epoch_size: as `ZeroStereoStream` takes them.
+        samples_per_photo: samples that are made from one photo, one after another.
     """
 
-    def __init__(self, sources: Any, seed: int, epoch_size: int | None, views_per_image: int = 1) -> None:
+    def __init__(self, sources: Any, seed: int, epoch_size: int | None, samples_per_photo: int = 1) -> None:
         if epoch_size is not None and epoch_size < 1:
             raise ValueError(f"epoch_size is a number of samples, 1 or more, or None for one exact pass over the photos; got {epoch_size}")
-        if views_per_image < 1:
-            raise ValueError(f"views_per_image is 1 or more; got {views_per_image}")
         self._seed = seed
         self._epoch_size = epoch_size
-        self._views = views_per_image
+        self._samples_per_photo = samples_per_photo
         self._manifests: dict[str, Manifest] = {}
         by_epoch = _by_epoch(sources)
         self._starts = sorted(by_epoch)
@@ -94,9 +93,10 @@ class Schedule:
         sizes = tuple(len(manifest) for manifest in manifests)
         if self._epoch_size is None and any(source.weight is not None for source in named.values()):
             logger.warning("without epoch_size an epoch is one pass over the photos and the sources' weights change nothing; set it")
-        photos = None if self._epoch_size is None else math.ceil(self._epoch_size / self._views)
+        photos = None if self._epoch_size is None else math.ceil(self._epoch_size / self._samples_per_photo)
         quotas = quotas_for(sizes, [source.weight for source in named.values()], photos)
-        return SourceSet(tuple(named), manifests, EpochPlan(self._seed, tuple(named), sizes, quotas, self._views, self._epoch_size))
+        plan = EpochPlan(self._seed, tuple(named), sizes, quotas, self._samples_per_photo, self._epoch_size)
+        return SourceSet(tuple(named), manifests, plan)
 
     def _manifest(self, urls: Any) -> Manifest:
         key = repr(urls)

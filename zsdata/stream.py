@@ -8,7 +8,7 @@ import logging
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import torch
@@ -16,13 +16,14 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from zsdata.augment import AugmentConfig
 from zsdata.faults import FailureBudget, FaultLog
-from zsdata.finish import Finisher
+from zsdata.finish import Finisher, Synthesis
 from zsdata.loader import StereoLoader
 from zsdata.meter import Meter
 from zsdata.position import Position
+from zsdata.prepared import Draft, Prepared, stack
 from zsdata.sample import StereoBatch
 from zsdata.sources import Schedule
-from zsdata.synthesis.depth import DepthEstimator
+from zsdata.synthesis.depth import DepthEstimator, load_depth
 from zsdata.synthesis.depth.builtin import warn_once
 from zsdata.synthesis.depth.cache import DepthCache
 from zsdata.synthesis.depth.identity import depth_identity
@@ -30,11 +31,12 @@ from zsdata.synthesis.disparity import AdaptiveDisparity, UniformDisparity
 from zsdata.synthesis.inpaint import Inpainter, load_inpainter
 from zsdata.synthesis.synthesizer import SynthesisConfig
 from zsdata.synthesis.view import ViewConfig
-from zsdata.worker import Prepared, Recipe, Worker
+from zsdata.worker import Recipe, Worker
 
 logger = logging.getLogger("zsdata")
 
 SMALLEST_CROP_PX = 32
+DEPTH_PLACEMENTS = ("auto", "worker", "device")
 DEPTH_CACHE_BYTES = 50_000_000_000  # about 50,000 photos of 480x640
 
 
@@ -60,6 +62,11 @@ class ZeroStereoStream(IterableDataset):
         epoch_size: samples per epoch; None is one exact pass over the photos, whatever their sources' weights.
         views_per_image: samples that are made from one photo, one after another: each a view, disparity and augmentation of its own. The
             photo is decoded, and its depth estimated, once for all of them, and the pairs of a batch resemble each other more.
+        reuse: samples that share one pair, one after another, each with an augmentation of its own: for inpainters that are slower than
+            the training. A multiple of it makes the best batch size.
+        depth_placement: "worker": depth is estimated by the loader's workers, on the CPU; "device": workers stop after decoding, and the
+            loader estimates and warps on its device; "auto": on the device for a network whose loader has a GPU, in the workers otherwise.
+            Plain iteration and `replay` do everything on the CPU.
         depth_cache: a folder that keeps the depth of every photo, so that a slow estimator is paid once per photo and not once per epoch.
             Any number of workers, ranks and runs may share it.
         depth_cache_bytes: the most that the folder may hold; 3 bytes per pixel of each photo. A full cache keeps what it has.
@@ -81,6 +88,8 @@ class ZeroStereoStream(IterableDataset):
         seed: int = 0,
         epoch_size: int | None = None,
         views_per_image: int = 1,
+        reuse: int = 1,
+        depth_placement: str = "auto",
         depth_cache: str | os.PathLike[str] | None = None,
         depth_cache_bytes: int = DEPTH_CACHE_BYTES,
         view: ViewConfig | None = None,
@@ -93,8 +102,15 @@ class ZeroStereoStream(IterableDataset):
             raise ValueError(f"seed is an integer >= 0; got {seed!r}")
         if size is not None and (len(size) != 2 or not all(isinstance(side, int) and side >= SMALLEST_CROP_PX for side in size)):
             raise ValueError(f"size is (height, width) in pixels, each {SMALLEST_CROP_PX} or more, or None for whole photos; got {size!r}")
-        self._schedule = Schedule(sources, seed, epoch_size, views_per_image)
+        for name, count in (("views_per_image", views_per_image), ("reuse", reuse)):
+            if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+                raise ValueError(f"{name} is an integer, 1 or more; got {count!r}")
+        if depth_placement not in DEPTH_PLACEMENTS:
+            raise ValueError(f"depth_placement is one of {', '.join(DEPTH_PLACEMENTS)}; got {depth_placement!r}")
+        self._depth_placement = depth_placement
         self._views_per_image = views_per_image
+        self._samples_per_photo = views_per_image * reuse
+        self._schedule = Schedule(sources, seed, epoch_size, self._samples_per_photo)
         self._revision = 0
         self._told_problems = 0
         self._tell_problems()
@@ -114,6 +130,7 @@ class ZeroStereoStream(IterableDataset):
             view=view if view is not None else ViewConfig(),
             synthesis=synthesis,
             inpainter_needs=tuple(getattr(inpainter, "needs", ())),
+            reuse=reuse,
         )
         if self._recipe.depth == "builtin":
             warn_once()  # here, and not in every worker
@@ -138,7 +155,7 @@ class ZeroStereoStream(IterableDataset):
         share, shares = (info.id, info.num_workers) if info else (0, 1)
         epoch = self._epoch
         for index in range(self._samples, self.epoch_size(epoch)):
-            if index // self._views_per_image % shares != share:  # the views of a photo stay together
+            if index // self._samples_per_photo % shares != share:  # what is made from one photo stays together
                 continue
             pair = self._make(epoch, index)
             self._samples = index + 1
@@ -196,9 +213,13 @@ class ZeroStereoStream(IterableDataset):
             raise ValueError(f"micro_batch is 1 or more; got {micro_batch}")
         if self._recipe.size is None and batch_size != 1:
             raise ValueError(f"whole photos (size=None) differ in size and come one at a time: batch_size is 1; got {batch_size}")
+        device = torch.device(device)
+        on_device = self._depth_placement == "device"
+        if self._depth_placement == "auto":
+            on_device = device.type != "cpu" and isinstance(self._recipe.depth, str) and self._recipe.depth != "builtin"
         return StereoLoader(
-            worker=self._worker,
-            finisher=self._finisher(torch.device(device), micro_batch),
+            worker=Worker(replace(self._recipe, depth_on_device=True)) if on_device else self._worker,
+            finisher=self._finisher(device, micro_batch, on_device),
             place=lambda: self._place(0, 0),
             revision=lambda: self._revision,
             epoch_size=self.epoch_size,
@@ -257,19 +278,22 @@ class ZeroStereoStream(IterableDataset):
         self._faults.add(1, prepared.rejected)
         return self._finish(prepared)
 
-    def _finish(self, prepared: Prepared) -> StereoBatch:
+    def _finish(self, prepared: Prepared | Draft) -> StereoBatch:
         if self._cpu_finisher is None:
             self._cpu_finisher = self._finisher(torch.device("cpu"), micro_batch=1)
-        return self._cpu_finisher(Prepared.stack([prepared]), self._meter)[0]
+        return self._cpu_finisher(stack([prepared]), self._meter)[0]
 
-    def _finisher(self, device: torch.device, micro_batch: int) -> Finisher:
-        return Finisher(load_inpainter(self._inpaint, device), self._augmentation, micro_batch, device)
+    def _finisher(self, device: torch.device, micro_batch: int, depth_on_device: bool = False) -> Finisher:
+        recipe = self._recipe
+        synthesis = Synthesis(load_depth(recipe.depth, device), recipe) if depth_on_device else None
+        return Finisher(load_inpainter(self._inpaint, device), self._augmentation, micro_batch, device, synthesis, recipe.reuse)
 
     def _place(self, epoch: int, samples: int) -> Position:
         recipe = self._recipe
         configuration = {
             "size": recipe.size,
             "views_per_image": self._views_per_image,
+            "reuse": recipe.reuse,
             "depth": _name_of(recipe.depth),
             "inpaint": _name_of(self._inpaint),
             "disparity": [type(recipe.disparity).__name__, asdict(recipe.disparity)],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -16,13 +16,14 @@ from torch import Tensor
 from zsdata.faults import BadPhoto, BadShard, NoUsablePhoto
 from zsdata.meter import Meter
 from zsdata.plan import Choice
+from zsdata.prepared import Draft, Prepared, Rejected, make
 from zsdata.seeding import rng
 from zsdata.source.photo import decode_rgb, probe_size
 from zsdata.sources import Schedule, SourceSet
 from zsdata.synthesis.depth import DepthEstimator, load_depth
 from zsdata.synthesis.depth.cache import DepthCache, photo_digest
 from zsdata.synthesis.disparity import AdaptiveDisparity, UniformDisparity
-from zsdata.synthesis.synthesizer import INPAINT_CONTEXT_PX, DepthMaps, SynthesisConfig, estimate_depth, synthesize
+from zsdata.synthesis.synthesizer import INPAINT_CONTEXT_PX, DepthMaps, SynthesisConfig, estimate_depth
 from zsdata.synthesis.view import ViewConfig, draw_view, view_photo, whole_view
 
 SHORTEST_SIDE_PX = 32  # a photo with a shorter side shows no scene
@@ -42,51 +43,8 @@ class Recipe:
     view: ViewConfig
     synthesis: SynthesisConfig
     inpainter_needs: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """A pair before inpainting, as it crosses the process border: images uint8, masks bool.
-
-    One sample has no batch axis and one `meta`; `stack` makes a batch of them. `right`, `inpaint` and the context reach INPAINT_CONTEXT_PX
-    columns beyond the crop's right edge. `right` is 0 in its holes; `right_disparity` and
-    `background` are there where the inpainter needs them. `rejected` lists (source, shard, key, reason) of the photos that could not be
-    used.
-    """
-
-    left: Tensor
-    right: Tensor
-    disparity: Tensor
-    confidence: Tensor
-    nonocclusion: Tensor
-    inpaint: Tensor
-    context: dict[str, Tensor]
-    meta: Any
-    rejected: list[tuple[str, str, str, str]] = field(default_factory=list)
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @staticmethod
-    def stack(samples: list[Prepared]) -> Prepared:
-        """Single samples to one batch, in order."""
-        tensors = {
-            name: torch.stack([getattr(sample, name) for sample in samples])
-            for name in ("left", "right", "disparity", "confidence", "nonocclusion", "inpaint")
-        }
-        meter = Meter()
-        for sample in samples:
-            meter.add(sample.seconds)
-        return Prepared(
-            **tensors,
-            context={name: torch.stack([sample.context[name] for sample in samples]) for name in samples[0].context},
-            meta=[sample.meta for sample in samples],
-            rejected=[reject for sample in samples for reject in sample.rejected],
-            seconds=meter.seconds,
-        )
-
-    def pin_memory(self) -> Prepared:
-        """The same in page-locked memory (called by torch's DataLoader)."""
-        values = {name: value.pin_memory() if isinstance(value, Tensor) else value for name, value in vars(self).items()}
-        return Prepared(**{**values, "context": {name: value.pin_memory() for name, value in self.context.items()}})
+    reuse: int  # samples, one after another, that are one pair with augmentations of their own
+    depth_on_device: bool = False  # workers hand over drafts, and whoever owns the device makes the pairs
 
 
 class _Photo:
@@ -115,93 +73,96 @@ class Worker:
         self._recipe = recipe
         self._depth: DepthEstimator | None = None
         self._last: tuple[tuple[str, int], _Photo] | None = None  # the photo whose next view comes next
+        self._last_pair: tuple[tuple[SourceSet, int, int], Prepared | Draft] | None = None
 
-    def prepare(self, epoch: int, index: int) -> Prepared:
+    def prepare(self, epoch: int, index: int) -> Prepared | Draft:
         """Sample `index` of `epoch` up to the holes; a photo that cannot be used is replaced by the sample's next spare.
+
+        With depth on the device it is a draft of that.
 
         Raises:
             NoUsablePhoto: when no spare can be used either, with the reasons.
             RuntimeError: when a step fails, with the sample named.
         """
         sources = self._recipe.schedule.at(epoch)
-        rejected: list[tuple[str, str, str, str]] = []
-        choice: Choice | None = sources.plan.choose(epoch, index)
+        pair = index - index % self._recipe.reuse
+        if self._last_pair is not None and self._last_pair[0] == (sources, epoch, pair):
+            made = self._last_pair[1]
+            return replace(made, meta={**made.meta, "index": index}, rejected=[], seconds={})
         with single_thread():
-            while choice is not None and len(rejected) <= MOST_SPARES:
-                member = sources.manifests[choice.source].member(choice.member)
-                name = sources.names[choice.source]
-                try:
-                    return self._pair(sources, choice, epoch, index, rejected)
-                except (BadPhoto, BadShard) as fault:
-                    rejected.append((name, member.shard_url, member.key, fault.reason))
-                except Exception as error:
-                    raise RuntimeError(
-                        f'sample {index} of epoch {epoch} (source "{name}", "{member.key}" in {member.shard_url}) failed: {error}'
-                    ) from error
-                choice = sources.plan.spare(epoch, index, len(rejected) - 1)
+            draft = self._draft(sources, epoch, index, pair)
+            made = draft
+            if draft.depth is not None and not self._recipe.depth_on_device:
+                with naming(draft.meta):
+                    meter = Meter()
+                    made = make(draft, draft.depth, self._recipe.inpainter_needs, self._recipe.synthesis, meter)
+                meter.add(draft.seconds)
+                made = replace(made, seconds=meter.seconds)
+        if self._recipe.reuse > 1:
+            self._last_pair = ((sources, epoch, pair), made)
+        return made
+
+    def _draft(self, sources: SourceSet, epoch: int, index: int, pair: int) -> Draft:
+        rejected: list[Rejected] = []
+        choice: Choice | None = sources.plan.choose(epoch, index)
+        while choice is not None and len(rejected) <= MOST_SPARES:
+            member = sources.manifests[choice.source].member(choice.member)
+            meta = {
+                "seed": self._recipe.seed,
+                "epoch": epoch,
+                "index": index,
+                "pair": pair,
+                "source": sources.names[choice.source],
+                "shard": member.shard_url,
+                "key": member.key,
+            }
+            try:
+                with naming(meta):
+                    return self._draft_from(sources, choice, meta, rejected)
+            except (BadPhoto, BadShard) as fault:
+                rejected.append((meta["source"], member.shard_url, member.key, fault.reason))
+            choice = sources.plan.spare(epoch, index, len(rejected) - 1)
         last = "; ".join(f"{key} in {shard}: {reason}" for _, shard, key, reason in rejected[-3:])
         raise NoUsablePhoto(
             f'no usable photo for sample {index} of epoch {epoch}: {len(rejected)} of source "{rejected[0][0]}" were refused, '
             f"the last ones: {last}. `zsdata verify` lists what is wrong with its shards."
         )
 
-    def _pair(self, sources: SourceSet, choice: Choice, epoch: int, index: int, rejected: list[tuple[str, str, str, str]]) -> Prepared:
+    def _draft_from(self, sources: SourceSet, choice: Choice, meta: dict[str, Any], rejected: list[Rejected]) -> Draft:
         recipe, meter = self._recipe, Meter()
-        manifest = sources.manifests[choice.source]
+        place = recipe.seed, meta["epoch"], meta["pair"]
         photo = self._open(sources, choice, meter)
-        scale = recipe.disparity.draw_scale(rng(recipe.seed, epoch, index, "disparity"), photo.size[1])
+        scale = recipe.disparity.draw_scale(rng(*place, "disparity"), photo.size[1])
         if recipe.size is None:
             view = whole_view(photo.size)
         else:
-            view = draw_view(photo.size, recipe.size, rng(recipe.seed, epoch, index, "view"), recipe.view, scale)
+            view = draw_view(photo.size, recipe.size, rng(*place, "view"), recipe.view, scale)
         with meter.stage("decode"):
             pixels = photo.pixels(view.reduction)
         with meter.stage("view"):
-            left = view_photo(pixels, view, photo.size[0] // pixels.shape[0])
+            left = _planes(view_photo(pixels, view, photo.size[0] // pixels.shape[0]))
         with meter.stage("depth"):
-            depth = self._depth_of(photo, view.rows)
-        made = synthesize(_image(left), depth, view, scale, recipe.synthesis, meter)
-
-        size = view.height, view.width - view.margin
+            digest = photo_digest(photo.data) if recipe.depth_cache is not None else ""
+            depth = self._depth_of(photo, digest, view.rows)
         context = {}
-        if "right_disparity" in recipe.inpainter_needs:
-            context["right_disparity"] = made.right_disparity[0].contiguous()
         if "background" in recipe.inpainter_needs:
             with meter.stage("background"):
-                context["background"] = (
-                    torch.from_numpy(self._background(sources, choice, epoch, index, photo, size)).permute(2, 0, 1).contiguous()
-                )
-        member = manifest.member(choice.member)
-        hole = made.inpaint_mask[..., : size[1]]
+                size = view.height, view.width - view.margin
+                context["background"] = _planes(self._background(sources, choice, rng(*place, "background"), photo, size))
         meta = {
-            "seed": recipe.seed,
-            "epoch": epoch,
-            "index": index,
-            "source": sources.names[choice.source],
-            "shard": member.shard_url,
-            "key": member.key,
+            **meta,
             "photo_size": list(photo.size),
             "window": list(view.window),
             "mirror": view.mirror,
             "scale_x": view.scale_x,
             "disparity_scale": scale,
-            "largest_disparity_px": float(made.disparity.max()),
-            "flip_consistency": round(float(depth.consistency[0]), 6),
             "replaced": [list(reject) for reject in rejected],  # photos that could not be used: source, shard, key, reason
-            "hole_share": float(hole.count_nonzero()) / hole.numel(),
         }
-        return Prepared(
-            left=_planes(left[:, : size[1]]),
-            right=_to_uint8(made.right),
-            disparity=made.disparity[0].contiguous(),
-            confidence=made.confidence[0].contiguous(),
-            nonocclusion=made.nonocclusion_mask[0].contiguous(),
-            inpaint=made.inpaint_mask[0].contiguous(),
-            context=context,
-            meta=meta,
-            rejected=rejected,
-            seconds=meter.seconds,
-        )
+        pixels_for_depth = None
+        if depth is None:
+            with meter.stage("decode"):
+                pixels_for_depth = _planes(photo.pixels())
+        return Draft(pixels_for_depth, depth, digest, left, view, scale, context, meta, rejected, meter.seconds)
 
     def _open(self, sources: SourceSet, choice: Choice, meter: Meter) -> _Photo:
         manifest = sources.manifests[choice.source]
@@ -212,32 +173,33 @@ class Worker:
             data = manifest.read(choice.member)
         with meter.stage("decode"):
             photo = _Photo(data)
-        self._last = (key, photo) if sources.plan.views_per_image > 1 else None
+        self._last = (key, photo) if sources.plan.samples_per_photo > 1 else None
         return photo
 
-    def _depth_of(self, photo: _Photo, rows: tuple[int, int]) -> DepthMaps:
-        """Depth of at least these rows: what is known of the photo already, or cached, or estimated now."""
+    def _depth_of(self, photo: _Photo, digest: str, rows: tuple[int, int]) -> DepthMaps | None:
+        """Depth of at least these rows: what is known of the photo already, or cached, or estimated now, or None: by the device."""
         if photo.depth is not None:
             return photo.depth
         cache = self._recipe.depth_cache
-        digest = photo_digest(photo.data) if cache is not None else ""
         cached = cache.load(digest, rows) if cache is not None else None
         if cached is not None and cached.size == photo.size:
             inverse_depth, confidence = (torch.from_numpy(values)[None, None] for values in (cached.inverse_depth, cached.confidence))
             return DepthMaps(inverse_depth, confidence, torch.tensor([cached.consistency], dtype=torch.float64), cached.first_row)
+        if self._recipe.depth_on_device:
+            return None
         if self._depth is None:
             self._depth = load_depth(self._recipe.depth)
         with torch.inference_mode():
-            photo.depth = estimate_depth(self._depth, _image(photo.pixels()), self._recipe.synthesis)
+            photo.depth = estimate_depth(self._depth, _planes(photo.pixels()).unsqueeze(0).float(), self._recipe.synthesis)
         if cache is not None:
-            maps = photo.depth
-            cache.store(digest, maps.inverse_depth[0, 0].numpy(), maps.confidence[0, 0].numpy(), float(maps.consistency[0]))
+            store_depth(cache, digest, photo.depth)
         return photo.depth
 
-    def _background(self, sources: SourceSet, choice: Choice, epoch: int, index: int, photo: _Photo, size: tuple[int, int]) -> np.ndarray:
+    def _background(
+        self, sources: SourceSet, choice: Choice, generator: np.random.Generator, photo: _Photo, size: tuple[int, int]
+    ) -> np.ndarray:
         """Another photo of the source at the size of the right view; the photo itself where the source has no other that can be read."""
         pixels: np.ndarray | None = None
-        generator = rng(self._recipe.seed, epoch, index, "background")
         manifest = sources.manifests[choice.source]
         for _ in range(3):
             other = int(generator.integers(len(manifest)))
@@ -257,14 +219,22 @@ def _planes(photo: np.ndarray) -> Tensor:
     return torch.from_numpy(np.stack(cv2.split(photo)))
 
 
-def _image(photo: np.ndarray) -> Tensor:
-    """uint8 [H, W, 3] to float32 [1, 3, H, W]."""
-    return _planes(photo).unsqueeze(0).float()
+def store_depth(cache: DepthCache, digest: str, depth: DepthMaps) -> None:
+    """Keeps the depth of one whole photo."""
+    inverse_depth, confidence = (values[0, 0].cpu().numpy() for values in (depth.inverse_depth, depth.confidence))
+    cache.store(digest, inverse_depth, confidence, float(depth.consistency[0]))
 
 
-def _to_uint8(image: Tensor) -> Tensor:
-    """float [1, 3, H, W] 0..255 to uint8 [3, H, W], rounded."""
-    return (image[0] + 0.5).int().to(torch.uint8)  # by way of int32: five times as fast
+@contextmanager
+def naming(meta: dict[str, Any]) -> Iterator[None]:
+    """Errors other than those of photos and shards say which sample they are about."""
+    try:
+        yield
+    except (BadPhoto, BadShard):
+        raise
+    except Exception as error:
+        sample = f"sample {meta['index']} of epoch {meta['epoch']}"
+        raise RuntimeError(f'{sample} (source "{meta["source"]}", "{meta["key"]}" in {meta["shard"]}) failed: {error}') from error
 
 
 class _OpenCVAcrossFork:
