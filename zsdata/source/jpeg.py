@@ -38,7 +38,7 @@ class Jpeg:
     width: int
     height: int
     components: int
-    working_bytes: int  # what the decoder holds beside the result: the coefficients, where they come in several scans
+    working_bytes: int  # what the decoder holds beside two RGB images: the coefficients, where they come in several scans
     orientation: int
     scan: int  # where the first scan's data begin
 

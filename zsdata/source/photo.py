@@ -14,7 +14,7 @@ from zsdata.source.png import Png
 from zsdata.source.webp import WebP
 
 MAX_PIXELS = 100_000_000  # what a camera makes; larger ones take seconds to decode
-MAX_DECODE_BYTES = 400_000_000  # for one photo, all that its decoding holds at once; a 60-megapixel JPEG takes 360 MB
+MAX_DECODE_BYTES = 380_000_000  # for one photo, all that its decoding holds at once; a 60-megapixel JPEG takes 360 MB
 MAX_SIDE = 65_535  # pixels; as JPEG has it
 
 _OTHERS = (  # at byte, signature, name
@@ -61,9 +61,12 @@ def decode_rgb(data: bytes, reduction: int = 1) -> np.ndarray:
     """
     photo = _open(data)
     if isinstance(photo, Jpeg):
+        _check_memory(photo, reduction)
         image = photo.decode(reduction)
     else:
-        image, reduction = photo.decode(), 1
+        reduction = 1
+        _check_memory(photo, reduction)
+        image = photo.decode()
     if image.shape != (-(-photo.height // reduction), -(-photo.width // reduction), 3):
         raise BadPhoto(
             f"damaged: {image.shape[1]} x {image.shape[0]} pixels where the header says {photo.width} x {photo.height}"
@@ -73,7 +76,11 @@ def decode_rgb(data: bytes, reduction: int = 1) -> np.ndarray:
 
 
 def probe_size(data: bytes) -> tuple[int, int]:
-    """Width and height in pixels of what `decode_photo` would return, without decoding; raises BadPhoto as far as it can know."""
+    """Width and height in pixels of what `decode_photo` would return, without decoding.
+
+    Raises:
+        BadPhoto: as far as it can know; whether the memory suffices depends on the reduction.
+    """
     photo = _open(data)
     return (photo.height, photo.width) if photo.orientation >= 5 else (photo.width, photo.height)
 
@@ -100,12 +107,15 @@ def _open(data: bytes) -> Jpeg | Png | WebP:
         raise BadPhoto(f"damaged: {width} x {height} pixels")
     if max(width, height) > MAX_SIDE or width * height > MAX_PIXELS:
         raise BadPhoto(f"too large: {width:,} x {height:,} pixels, at most {MAX_PIXELS // 1_000_000} megapixels and {MAX_SIDE:,} a side")
-    needed = 3 * width * height + max(photo.working_bytes, 3 * width * height)  # a second RGB is held while it is turned or reordered
-    if needed > MAX_DECODE_BYTES:
-        raise BadPhoto(
-            f"too large: {width:,} x {height:,} pixels take {needed // 1_000_000} MB to decode, at most {MAX_DECODE_BYTES // 1_000_000}"
-        )
     return photo
+
+
+def _check_memory(photo: Jpeg | Png | WebP, reduction: int) -> None:
+    """Refuses what would take more than MAX_DECODE_BYTES: two RGB, as OpenCV copies its own, and what the format needs beside."""
+    side = f"{photo.width:,} x {photo.height:,} pixels"
+    needed = photo.working_bytes + 6 * -(-photo.width // reduction) * -(-photo.height // reduction)
+    if needed > MAX_DECODE_BYTES:
+        raise BadPhoto(f"too large: {side} take {needed // 1_000_000} MB to decode, at most {MAX_DECODE_BYTES // 1_000_000}")
 
 
 def _what_else(data: bytes) -> str:

@@ -13,7 +13,7 @@ from zsdata.source.ranges import ShardFile, ends_inside
 BLOCK = 512
 MAX_EXTENSION_BYTES = 1 << 20  # the longest long-name or pax record that is read; real ones have a few hundred bytes
 SCAN_BYTES = 1 << 20  # read at a time when looking for the next header
-MAX_SEARCH_BYTES = 1 << 32  # how far a header is looked for, and zeros are read; a hole in a file has terabytes in no time
+MAX_SEARCH_BYTES = 1 << 30  # how far a header is looked for, and zeros are read: a file may have a hole of terabytes
 RECORD_BYTES = (10_240, *(BLOCK << power for power in range(1, 12)))  # what writers fill the last record up to; tar itself 10,240
 
 Kind = Literal["file", "folder", "link", "device", "sparse", "other"]
@@ -247,8 +247,8 @@ def _check_end(file: ShardFile, offset: int, block: bytes) -> None:
         raise _Damage(BadShard(f"{what}; download it again", file.url, file.size), None)
     position = offset + BLOCK
     while position - offset < MAX_SEARCH_BYTES and (chunk := file.read_at(position, SCAN_BYTES)):
-        rest = chunk.lstrip(b"\0")
-        if rest:
+        if chunk != bytes(len(chunk)):
+            rest = chunk.lstrip(b"\0")
             start = offset + (position + len(chunk) - len(rest) - offset) // BLOCK * BLOCK
             raise _Damage(
                 BadShard("data behind the end of the archive: zeroed in the middle, or several tars in one", file.url, offset),

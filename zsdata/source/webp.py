@@ -60,8 +60,8 @@ class WebP:
 
     @property
     def working_bytes(self) -> int:
-        """What the decoder holds beside the result: a lossless one its colours, and both an image with alpha."""
-        return self.width * self.height * (8 if self.may_have_alpha else 0)
+        """What the decoder holds beside two RGB images: a lossless one its colours, and both an image with alpha."""
+        return self.width * self.height * (4 if self.may_have_alpha else 0)
 
     def decode(self) -> np.ndarray:
         """uint8 [height, width, 3] RGB over white."""
