@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import shlex
 import sys
 import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -29,6 +31,8 @@ from zsdata.source.archive import Problem
 from zsdata.source.pack import PackReport, pack
 from zsdata.source.urls import expand_urls
 from zsdata.source.verify import verify
+from zsdata.sources import parse_sources
+from zsdata.statistics import source_statistics
 from zsdata.stream import ZeroStereoStream
 from zsdata.synthesis.depth import load_depth
 from zsdata.synthesis.inpaint import Inpainter, load_inpainter
@@ -179,6 +183,25 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--views-per-image", metavar="N", type=_positive, default=1, help="pairs from each photo (default: %(default)s)")
 
     command = add(
+        _stats,
+        "stats",
+        "say what the pairs of each source are like",
+        "Makes pairs of whole photos, without augmentation, and prints a row per source: mean and largest disparity (in pixels, and as "
+        "shares of the photo's width), how much of the left image is hidden in the right one, how much of the right one was invented, how "
+        "well depth survives mirroring the photo, and how well the left image is reconstructed from the right one by the label (mean "
+        "absolute error in 0..1, SSIM, photometric loss; over whole images, hidden pixels included).",
+        example="zsdata stats --sources indoor=indoor.tar street=street.tar --pairs 200",
+    )
+    command.add_argument(
+        "--sources", metavar="SHARDS", nargs="+", required=True, help=_URLS + "; NAME=URL gives a source a name and a row of its own"
+    )
+    command.add_argument(
+        "--pairs", metavar="N", type=_positive, default=100, help="pairs to look at, of all sources (default: %(default)s)"
+    )
+    _add_steps(command)
+    command.add_argument("--json", metavar="FILE", type=Path, help="write the figures there too")
+
+    command = add(
         _export,
         "export",
         "write pairs to disk, in the layout of ZeroStereo's published data set",
@@ -312,9 +335,41 @@ def _preview(options: argparse.Namespace) -> int:
         f"{_printable(str(output))}: {_several(len(pairs), 'pair')}, {height} px high and {width} px wide, seed {options.seed}, "
         f"from epoch {options.epoch}, index {options.first_index} to epoch {last['epoch']}, index {last['index']}"
     )
+    _tell_refused(stream)
+    return OK
+
+
+def _tell_refused(stream: ZeroStereoStream) -> None:
     refused = stream.stats()["rejected"]
     if refused:
         print(f"photos that could not be used and were replaced: {', '.join(f'{reason}: {n:,}' for reason, n in refused.items())}")
+
+
+def _stats(options: argparse.Namespace) -> int:
+    sources = parse_sources(options.sources)
+    if isinstance(sources, list):
+        sources = expand_urls(sources)
+    stream = ZeroStereoStream(
+        sources,
+        size=None,
+        depth=load_depth(options.depth),
+        inpaint=load_inpainter(options.inpaint),
+        seed=options.seed,
+        augmentation=AugmentConfig.none(),
+    )
+    pairs = min(options.pairs, len(stream))
+    with tqdm(total=pairs, desc="looking at pairs", unit="pair", disable=None) as bar:
+        statistics = source_statistics(stream, pairs, bar.update)
+    if options.json is not None:
+        options.json.write_text(json.dumps({name: asdict(row) for name, row in statistics.items()}, indent=2) + "\n", encoding="utf-8")
+    print("                             disparity, px  share of width    share of pixels     flip   reconstruction of the left image")
+    print("source                pairs    mean     max    mean    max   hidden  invented  consist.  abs. error    SSIM  photometric")
+    for name, row in statistics.items():
+        print(
+            f"{_printable(name):20.20} {row.pairs:6,} {row.mean_px:7.2f} {row.max_px:7.2f} {row.mean_share:7.3f} {row.max_share:6.3f} "
+            f"{row.hidden:8.3f} {row.invented:9.3f} {row.flip_consistency:9.3f} {row.abs_err:11.4f} {row.ssim:7.3f} {row.photometric:12.4f}"
+        )
+    _tell_refused(stream)
     return OK
 
 

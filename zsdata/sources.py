@@ -31,6 +31,30 @@ class ImageSource:
     weight: float | None = None
 
 
+def parse_sources(specs: Sequence[str]) -> list[str] | dict[str, ImageSource]:
+    """Sources as a command line names them: urls, or NAME=URL and NAME=URL@WEIGHT ("indoor=in.tar@0.7").
+
+    Raises:
+        ValueError: a name without a url, a weight that is no number, or names for some only.
+    """
+    named = ["=" in spec.split("://")[0] for spec in specs]
+    if not any(named):
+        return list(specs)
+    sources: dict[str, ImageSource] = {}
+    for spec in specs:
+        name, _, rest = spec.partition("=")
+        urls, weight = rest.rsplit("@", 1) if "@" in rest else (rest, "")
+        if not name or not urls or name in sources:
+            raise ValueError(
+                f"a named source is NAME=URL or NAME=URL@WEIGHT, each name once, and all sources have one or none; got {spec!r}"
+            )
+        try:
+            sources[name] = ImageSource(urls, weight=float(weight) if weight else None)
+        except ValueError:
+            raise ValueError(f"the weight in {spec!r} is no number") from None
+    return sources
+
+
 @dataclass(frozen=True)
 class SourceSet:
     """The sources that are in use together, and the plan of their epochs."""
