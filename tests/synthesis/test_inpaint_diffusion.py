@@ -1,10 +1,12 @@
 import json
+import logging
 import os
+import pickle
 import re
 import shutil
 import subprocess
 import sys
-from pathlib import Path
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -15,16 +17,18 @@ from hypothesis.extra.numpy import arrays
 from safetensors.torch import load_file, save_file
 
 from tests import oracles_diffusion as oracle
-from tests.scenes import photo_tar
+from tests.scenes import SHARED, photo_tar
 from zsdata import ZeroStereoStream, load_inpainter
 from zsdata.seeding import rng
-from zsdata.synthesis.inpaint import fill
-from zsdata.synthesis.inpaint.diffusion import SCHEDULERS, latent_mask
+from zsdata.synthesis.inpaint import diffusion, fill
+from zsdata.synthesis.inpaint.diffusion import AUTOENCODER_BATCH, latent_mask
+from zsdata.synthesis.inpaint.options import DiffusionNetwork
+from zsdata.synthesis.inpaint.schedulers import SCHEDULERS
 
 diffusers = pytest.importorskip("diffusers")
 transformers = pytest.importorskip("transformers")
 
-PUBLISHED = Path(__file__).resolve().parents[2] / ".." / "shared" / "published"
+PUBLISHED = SHARED / "published"
 
 
 @pytest.fixture(scope="module")
@@ -140,10 +144,34 @@ def test_a_sample_does_not_depend_on_the_samples_beside_it(folder, scheduler):
     inpainter = load_inpainter(folder, steps=3, scheduler=scheduler)
     right, inpaint_mask = scenes(8)
     whole = inpainter(right, inpaint_mask, generators(*range(8)))
-    for micro_batch in (1, 3, 8):
+    for micro_batch in (1, 3, 8, None):
         assert torch.equal(fill(inpainter, right, inpaint_mask, generators(*range(8)), {}, micro_batch), whole)
     order = [5, 0, 7, 2]
     assert torch.equal(inpainter(right[order], inpaint_mask[order], generators(*order)), whole[order])
+
+
+@pytest.mark.parametrize("micro_batch", [1, 3, 8])
+def test_the_micro_batch_changes_no_more_than_rounding(folder, inpainter, micro_batch, monkeypatch):
+    """As on a GPU, where many samples go through the networks at once."""
+    right, inpaint_mask = scenes(8)
+    expected = inpainter(right, inpaint_mask, generators(*range(8)))
+    together, seen = load_inpainter(folder, steps=3), []
+    together.micro_batch.size = micro_batch
+    unet, encode = together._unet.forward, together._autoencoder.encode
+    monkeypatch.setattr(together._unet, "forward", lambda noisy, *_, **__: seen.append(len(noisy)) or unet(noisy, *_, **__))
+    monkeypatch.setattr(together._autoencoder, "encode", lambda images: seen.append(-len(images)) or encode(images))
+    made = together(right, inpaint_mask, generators(*range(8)))
+    assert max(seen) == micro_batch and min(seen) == -min(micro_batch, AUTOENCODER_BATCH)
+    assert torch.allclose(made, expected, rtol=0, atol=1e-4 * 127.5)
+
+
+def test_samples_without_holes_skip_the_network(inpainter, monkeypatch):
+    right, inpaint_mask = scenes(3)
+    inpaint_mask[1] = False
+    seen, unet = [], inpainter._unet.forward
+    monkeypatch.setattr(inpainter._unet, "forward", lambda noisy, *_, **__: seen.append(len(noisy)) or unet(noisy, *_, **__))
+    filled = fill(inpainter, right, inpaint_mask, generators(0, 1, 2), {}, None)
+    assert sum(seen) == 2 * 3 and torch.equal(filled[1], right[1])  # two samples, three steps
 
 
 def test_each_sample_has_noise_of_its_own(inpainter):
@@ -238,7 +266,8 @@ def test_an_autocast_around_it_changes_nothing(inpainter):
 def test_a_compiled_unet_is_used(folder, inpainter):
     right, inpaint_mask = scenes(1)
     compiled = load_inpainter(folder, steps=3, compile=True)
-    assert compiled._unet._compiled_call_impl is not None and inpainter._unet._compiled_call_impl is None
+    parts = compiled._unet, compiled._autoencoder.encoder, compiled._autoencoder.decoder
+    assert all(part._compiled_call_impl is not None for part in parts) and inpainter._unet._compiled_call_impl is None
     with torch.compiler.set_stance("force_eager"):
         assert torch.equal(compiled(right, inpaint_mask, generators(0)), inpainter(right, inpaint_mask, generators(0)))
 
@@ -249,9 +278,9 @@ def test_no_global_random_number_is_drawn(folder):
     assert torch.equal(torch.get_rng_state(), before[0]) and np.array_equal(np.random.get_state()[1], before[1])  # noqa: NPY002
 
 
-def test_a_pipeline_deeper_in_the_folder_is_found_and_named(folder):
+def test_a_pipeline_deeper_in_the_folder_is_found(folder):
     inpainter = load_inpainter(folder.parent, steps=2, subfolder=folder.name)
-    assert (inpainter.name, inpainter.subfolder, inpainter.revision, inpainter.steps) == (str(folder.parent), folder.name, None, 2)
+    assert inpainter(*scenes(1), generators(0)).shape == (1, 3, 48, 64)
 
 
 def test_a_hub_id_is_found_in_the_cache_without_network(folder, tmp_path):
@@ -262,7 +291,7 @@ def test_a_hub_id_is_found_in_the_cache_without_network(folder, tmp_path):
     program = (
         "from zsdata import load_inpainter\n"
         'inpainter = load_inpainter("somebody/pipelines", steps=2, subfolder="inpainting", revision="v1")\n'
-        'assert inpainter.revision == "v1"\n'
+        'assert inpainter.network.revision == "v1"\n'
         "try:\n"
         '    load_inpainter("somebody/pipelines", steps=2, revision="v1")\n'
         "except OSError as error:\n"
@@ -281,17 +310,87 @@ def test_a_pipeline_works_in_the_stream(folder, tmp_path):
     assert len(pairs) == 2 and all(len(values) and torch.isfinite(values).all() and values.std() > 0 for values in holes)
 
 
-def test_out_of_memory_says_what_to_lower(folder, monkeypatch):
-    inpainter = load_inpainter(folder, steps=2)
+def limit_memory(inpainter, most, monkeypatch):
+    """Lets the U-Net take `most` samples at once."""
+    unet = inpainter._unet.forward
 
-    def full(*_, **__):
-        raise torch.OutOfMemoryError("CUDA out of memory")
+    def limited(noisy, *arguments, **options):
+        if len(noisy) > most:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        return unet(noisy, *arguments, **options)
 
-    monkeypatch.setattr(inpainter._unet, "forward", full)
-    with pytest.raises(MemoryError, match=r"3 images of 48x64.*lower micro_batch \(now 3\)"):
-        inpainter(*scenes(3), generators(0, 1, 2))
-    with pytest.raises(MemoryError, match=r"1 images of 48x64.*: take a smaller crop"):
-        inpainter(*scenes(1), generators(0))
+    monkeypatch.setattr(inpainter._unet, "forward", limited)
+
+
+def test_out_of_memory_lowers_the_micro_batch_and_nothing_else(folder, inpainter, monkeypatch, caplog):
+    right, inpaint_mask = scenes(5)
+    full = load_inpainter(folder, steps=3)
+    full.micro_batch.size = 5
+    limit_memory(full, 2, monkeypatch)
+    with caplog.at_level(logging.WARNING, "zsdata"):
+        made = full(right, inpaint_mask, generators(*range(5)))
+        full(right, inpaint_mask, generators(*range(5)))
+    assert torch.allclose(made, inpainter(right, inpaint_mask, generators(*range(5))), rtol=0, atol=1e-4 * 127.5)
+    assert (full.micro_batch.size, full.micro_batch.lowered, len(caplog.records)) == (2, 1, 1)
+
+
+def test_a_sample_that_does_not_fit_says_what_to_lower(folder, monkeypatch):
+    full = load_inpainter(folder, steps=2)
+    limit_memory(full, 0, monkeypatch)
+    with pytest.raises(MemoryError, match=r"not enough memory for one sample \(diffusion inpainting\): .*take a smaller crop"):
+        full(*scenes(3), generators(0, 1, 2))
+    with pytest.raises(MemoryError, match="smaller crop"):
+        full.warm_up((48, 64))
+
+
+def test_a_warm_up_runs_the_networks_and_says_what_they_take(folder, monkeypatch):
+    inpainter, seen = load_inpainter(folder, steps=50), []
+    unet = inpainter._unet.forward
+    monkeypatch.setattr(inpainter._unet, "forward", lambda noisy, *_, **__: seen.append(noisy.shape) or unet(noisy, *_, **__))
+    report = inpainter.warm_up((43, 64))
+    assert seen == [(1, 9, 6, 8)] * 2  # not all 50 steps
+    assert (report.micro_batch, report.peak_bytes) == (1, None)
+    assert str(report).startswith(f"inpainting {folder} at 43x64, torch.float32: micro-batch 1, warm after")
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_on_a_gpu_the_micro_batch_is_found_and_memory_counted(folder):
+    inpainter = load_inpainter(folder, "cuda", steps=2, dtype="float32")
+    report = inpainter.warm_up((48, 64))
+    assert report.micro_batch == inpainter.micro_batch.size > 1 and report.peak_bytes > 0
+    right, inpaint_mask = (tensor.cuda() for tensor in scenes(3))
+    made = inpainter(right, inpaint_mask, generators(0, 1, 2))
+    expected = load_inpainter(folder, steps=2)(right.cpu(), inpaint_mask.cpu(), generators(0, 1, 2))
+    assert (made.cpu() - expected).abs().mean() < 0.1
+    little = load_inpainter(folder, "cuda", steps=2, memory_gib=1e-3)
+    assert little.warm_up((48, 64)).micro_batch == 1
+
+
+def test_auto_takes_what_the_budget_allows(folder, monkeypatch):
+    """On a pretended GPU whose need is a quarter of a GiB a sample."""
+    inpainter, tried = load_inpainter(folder, memory_gib=1.2), []
+    monkeypatch.setattr(inpainter, "_try", lambda samples, size: tried.append(samples))
+    monkeypatch.setattr(diffusion, "measure", lambda work, device: (work(), (tried[-1] * 2**28, 0.5))[1])
+    monkeypatch.setattr(inpainter, "_to_be_found", True)
+    report = inpainter.warm_up((48, 64))
+    assert tried == [1, 2, 4, 4] and report.micro_batch == 4
+    assert 2**30 < report.peak_bytes < 1.01 * 2**30  # the small weights are counted too
+    assert report.seconds == 2
+
+
+def test_no_samples_are_no_work(inpainter):
+    right, inpaint_mask = scenes(1)
+    assert inpainter(right[:0], inpaint_mask[:0], []).shape == (0, 3, 48, 64)
+
+
+def test_a_configured_network_is_an_argument_of_the_stream(folder):
+    network = DiffusionNetwork(str(folder), steps=2, scheduler="dpm++", dtype="bf16")
+    assert pickle.loads(pickle.dumps(network)) == network and json.loads(json.dumps(asdict(network)))["steps"] == 2
+    inpainter = load_inpainter(network)
+    assert (inpainter.network, inpainter.scheduler, inpainter.dtype) == (network, "DPMSolverMultistepScheduler", torch.bfloat16)
+    for takes_none in (network, "builtin", inpainter):
+        with pytest.raises(TypeError, match="steps"):
+            load_inpainter(takes_none, steps=3)
 
 
 def test_a_missing_package_is_named_with_its_cure(folder, monkeypatch):
@@ -366,6 +465,10 @@ def test_a_name_that_is_nowhere_is_said(tmp_path):
         ({"steps": 0}, "steps is 1 or more; got 0"),
         ({"steps": 1001}, "1001"),
         ({"dtype": "int8"}, "got int8"),
+        ({"micro_batch": 0}, 'micro_batch is 1 or more, or "auto"; got 0'),
+        ({"micro_batch": "all"}, "got 'all'"),
+        ({"compile": "fast"}, "compile is True, False or one of default, reduce-overhead"),
+        ({"memory_gib": 0}, "memory_gib is more than 0; got 0"),
         ({"scheduler": "fastest"}, 'got "fastest"'),
         ({"scheduler": "NoScheduler"}, 'got "NoScheduler"'),
         ({"scheduler": "FlowMatchEulerDiscreteScheduler"}, "another kind of model"),

@@ -2,9 +2,8 @@
 
 An inpainter is anything with `__call__(right, inpaint_mask, generators) -> right`: right is float32 [B, 3, H, W] RGB 0..255, inpaint_mask
 bool [B, 1, H, W], True in the holes, and generators holds one numpy Generator per sample. One that wants to know more lists it in `needs`
-and gets it by
-keyword: `right_disparity` (float32 [B, 1, H, W], 0 in holes) or `background` (another photo of the same source at the crop's size,
-float32 [B, 3, H, W]).
+and gets it by keyword: `right_disparity` (float32 [B, 1, H, W], 0 in holes) or `background` (another photo of the same source at the
+crop's size, float32 [B, 3, H, W]). One that has to get ready has `warm_up(size)` (see `DiffusionInpainter`).
 """
 
 from __future__ import annotations
@@ -17,18 +16,29 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from zsdata.synthesis.inpaint.options import DiffusionNetwork
+
 Inpainter = Callable[..., Tensor]
 
 
-def load_inpainter(inpaint: str | os.PathLike[str] | Inpainter, device: str | torch.device = "cpu", **options: Any) -> Inpainter:
+def load_inpainter(
+    inpaint: str | os.PathLike[str] | DiffusionNetwork | Inpainter, device: str | torch.device = "cpu", **options: Any
+) -> Inpainter:
     """Turns the stream's `inpaint` argument into a callable `inpaint(right, inpaint_mask, generators) -> right`.
 
     Args:
         inpaint: "builtin"; "background" (MfS-Stereo's: another photo, colours matched); a Hub id or a local folder in the diffusers
-            format (needs the "diffusion" extra); or a callable, returned as it is.
+            format (needs the "diffusion" extra), or a `DiffusionNetwork` with options; or a callable, returned as it is.
         device: where a network is put; the built-in inpainters follow their input.
-        options: of the diffusion inpainter, such as `steps`.
+        options: of a pipeline given by name, those of `DiffusionNetwork`: `steps`, `scheduler`, `subfolder`, ...
+
+    Raises:
+        TypeError: options for something that takes none.
     """
+    if isinstance(inpaint, DiffusionNetwork):
+        if options:
+            raise TypeError(f"a DiffusionNetwork has its options already; got {sorted(options)} beside it")
+        return _diffusion(inpaint, device)
     if callable(inpaint):
         if options:
             raise TypeError(f"a callable inpainter takes no options; got {sorted(options)}")
@@ -44,9 +54,13 @@ def load_inpainter(inpaint: str | os.PathLike[str] | Inpainter, device: str | to
         from zsdata.synthesis.inpaint.background import RandomBackground
 
         return RandomBackground()
+    return _diffusion(DiffusionNetwork(name, **options), device)
+
+
+def _diffusion(network: DiffusionNetwork, device: str | torch.device) -> Inpainter:
     from zsdata.synthesis.inpaint.diffusion import DiffusionInpainter
 
-    return DiffusionInpainter(name, device, **options)
+    return DiffusionInpainter(network, device)
 
 
 def fill(
@@ -55,19 +69,21 @@ def fill(
     inpaint_mask: Tensor,
     generators: Sequence[np.random.Generator],
     context: Mapping[str, Tensor],
-    micro_batch: int,
+    micro_batch: int | None,
 ) -> Tensor:
     """`right` without holes: the inpainter's pixels in the holes, the known pixels as they are, `micro_batch` samples at a time.
 
-    A sample without a hole does not reach the inpainter. `context` holds what the inpainter's `needs` name.
+    A sample without a hole does not reach the inpainter. `context` holds what the inpainter's `needs` name. With `micro_batch` None the
+    inpainter gets all samples at once: one that knows what fits into memory divides them itself.
 
     Raises:
         ValueError: where the inpainter returns another shape or values that are not finite.
     """
     filled = right.clone()
     with_holes = inpaint_mask.flatten(1).any(1).nonzero().flatten().tolist()
-    for start in range(0, len(with_holes), micro_batch):
-        part = with_holes[start : start + micro_batch]
+    at_once = max(1, len(with_holes)) if micro_batch is None else micro_batch
+    for start in range(0, len(with_holes), at_once):
+        part = with_holes[start : start + at_once]
         extra = {name: context[name][part] for name in getattr(inpainter, "needs", ())}
         made = inpainter(right[part], inpaint_mask[part], [generators[i] for i in part], **extra)
         if made.shape != right[part].shape:

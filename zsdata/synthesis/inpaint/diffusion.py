@@ -8,10 +8,9 @@ to latent size by nearest neighbour: here a cell is known only if every pixel in
 from __future__ import annotations
 
 import inspect
-import warnings
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Sequence
 from copy import deepcopy
-from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -20,16 +19,14 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from zsdata.synthesis.inpaint.diffusion_parts import CELL_PX, LATENT_CHANNELS, load_diffusion_parts
+from zsdata.synthesis.inpaint.options import DiffusionNetwork
+from zsdata.synthesis.inpaint.schedulers import make_scheduler
+from zsdata.synthesis.micro_batch import AUTO_SHARE, GIB, MicroBatch, WarmUp, free_bytes, largest_micro_batch, measure, weight_bytes
+from zsdata.synthesis.precision import choose_dtype
 
-# Short names of the schedulers that people use; any other scheduler of diffusers goes by its class name.
-SCHEDULERS = {
-    "ddim": "DDIMScheduler",
-    "dpmsolver++": "DPMSolverMultistepScheduler",
-    "euler": "EulerDiscreteScheduler",
-    "lcm": "LCMScheduler",
-    "tcd": "TCDScheduler",
-}
-DTYPES = {"float32": torch.float32, "bf16": torch.bfloat16, "bfloat16": torch.bfloat16, "fp16": torch.float16, "float16": torch.float16}
+AUTOENCODER_BATCH = 4  # images; at full resolution they keep a GPU busy, and more would take most of the memory
+TRIAL_STEPS = 2  # of a warm-up: all steps take the same memory, and some schedulers do more from the second one on
+MANY = sys.maxsize  # more memory than there is
 
 
 class DiffusionInpainter:
@@ -38,52 +35,38 @@ class DiffusionInpainter:
     A sample's result depends on its image, mask and noise, not on the samples beside it: on the CPU bit by bit, on a GPU up to rounding.
 
     Args:
-        name: a Hub id or a local folder (U-Net of 9 input channels, VAE, scheduler, text encoder, tokenizer; safetensors).
+        network: which pipeline, and how it is run.
         device: where the networks are put.
-        steps: denoising steps, T in the paper.
-        scheduler: "ddim" (the paper's), "dpmsolver++", "euler", "lcm", "tcd", or a scheduler class of diffusers by name. It takes the noise
-            schedule from the pipeline's own scheduler configuration.
-        autoencoder: a Hub id or folder of another autoencoder in the same latent space, such as a tiny one (`AutoencoderTiny`).
-        dtype: of the networks: a torch.dtype or "float32", "bf16", "fp16". None is float32 on the CPU; on CUDA bfloat16 where the GPU has
-            it, else float16. The denoised latent itself is kept in float32.
-        compile: whether the U-Net goes through `torch.compile`.
-        subfolder: where in the repository or folder the pipeline lies.
-        revision: branch, tag or commit of a Hub id.
 
-    The arguments stay readable as attributes of the same names, `dtype` and `scheduler` as what they came to.
+    Attributes:
+        network, device: as given.
+        dtype, scheduler: what was chosen: the networks' torch.dtype, the scheduler's class name.
+        micro_batch: how many samples go through the U-Net at once (`.size`), and how often that had to be lowered (`.lowered`).
 
     Raises:
         ImportError: the "diffusion" extra is not installed.
-        OSError, ValueError: what `load_diffusion_parts` raises; a scheduler, dtype or number of steps that cannot be used.
+        OSError, ValueError: what `load_diffusion_parts` and `make_scheduler` raise.
     """
 
-    def __init__(
-        self,
-        name: str,
-        device: str | torch.device = "cpu",
-        *,
-        steps: int = 50,
-        scheduler: str = "ddim",
-        autoencoder: str | None = None,
-        dtype: torch.dtype | str | None = None,
-        compile: bool = False,
-        subfolder: str = "",
-        revision: str | None = None,
-    ) -> None:
-        if steps < 1:
-            raise ValueError(f"steps is 1 or more; got {steps}")
-        self.name, self.subfolder, self.revision, self.autoencoder, self.steps = name, subfolder, revision, autoencoder, steps
+    def __init__(self, network: DiffusionNetwork, device: str | torch.device = "cpu") -> None:
+        self.network = network
         self.device = torch.device(device)
-        self.dtype = _dtype(dtype, self.device)
-        parts = load_diffusion_parts(name, subfolder, revision, autoencoder, self.dtype)
-        self._scheduler = _scheduler(scheduler, parts.scheduler_config, steps)
+        self.dtype = choose_dtype(network.dtype, self.device)
+        parts = load_diffusion_parts(network.name, network.subfolder, network.revision, network.autoencoder, self.dtype)
+        self._scheduler = make_scheduler(network.scheduler, parts.scheduler_config, network.steps)
         self.scheduler = type(self._scheduler).__name__
         self._unet, self._autoencoder = (
-            network.to(self.device, memory_format=torch.channels_last) for network in (parts.unet, parts.autoencoder)
+            part.to(self.device, memory_format=torch.channels_last) for part in (parts.unet, parts.autoencoder)
         )
         self._prompt = parts.prompt.to(self.device)
-        if compile:
-            self._unet.compile()
+        if network.compile:
+            mode = network.compile if isinstance(network.compile, str) else None
+            for module in (self._unet, self._autoencoder.encoder, self._autoencoder.decoder):
+                module.compile(mode=mode)
+        cure = 'lower memory elsewhere, take a smaller crop, dtype="bf16" or "fp16", or a tiny autoencoder; fewer steps would not help'
+        asked = 1 if network.micro_batch == "auto" else network.micro_batch
+        self.micro_batch = MicroBatch("diffusion inpainting", asked, self.device, cure)
+        self._to_be_found = network.micro_batch == "auto" and self.device.type != "cpu"
 
     def __call__(self, right: Tensor, inpaint_mask: Tensor, generators: Sequence[np.random.Generator]) -> Tensor:
         """`right` with its holes filled.
@@ -98,11 +81,13 @@ class DiffusionInpainter:
 
         Raises:
             ValueError: for other shapes or dtypes.
-            MemoryError: the device's memory does not suffice; the message says what to lower.
+            MemoryError: the device's memory does not suffice for one sample; the message says what to lower.
         """
         _check(right, inpaint_mask)
         if len(generators) != len(right):
             raise ValueError(f"one generator per sample: {len(right)} samples, {len(generators)} generators")
+        if not len(right):
+            return right.clone()
         shape = _latent_shape(right)
         noise = torch.from_numpy(np.stack([generator.standard_normal(shape, dtype=np.float32) for generator in generators]))
         return torch.where(inpaint_mask, self.inpaint_from_noise(right, inpaint_mask, noise), right)
@@ -127,21 +112,57 @@ class DiffusionInpainter:
         expected = (len(right), *_latent_shape(right))
         if noise.shape != expected:
             raise ValueError(f"noise must be {list(expected)} for images of {list(right.shape)}; got {list(noise.shape)}")
-        try:
-            # On the CPU one at a time: in a batch the order of sums, and with it the last bits, would depend on how many there are.
-            size = 1 if self.device.type == "cpu" else max(len(right), 1)
-            parts = zip(right.split(size), inpaint_mask.split(size), noise.split(size), strict=True)
-            return torch.cat([self._decoded(*part) for part in parts]).to(right.device)
-        except torch.OutOfMemoryError as error:
-            B, _, H, W = right.shape
-            fewer = f"lower micro_batch (now {B}), or " if B > 1 else ""
-            raise MemoryError(
-                f"{self.device} ran out of memory while inpainting {B} images of {H}x{W} in {self.dtype}: {fewer}take a smaller crop, "
-                'dtype="bf16" or "fp16", or a tiny autoencoder; fewer steps would not help'
-            ) from error
+        if self._to_be_found:
+            self.warm_up((right.shape[-2], right.shape[-1]))
+        made = self.micro_batch.run(lambda part: self._inpaint(right[part], inpaint_mask[part], noise[part]), len(right))
+        return torch.cat([right.new_empty(0, *right.shape[1:]), *(part.to(right.device) for part in made)])
+
+    def warm_up(self, size: tuple[int, int]) -> WarmUp:
+        """Runs the networks on empty images of this (height, width); finds the micro-batch where it is "auto"; says what memory it takes.
+
+        Raises:
+            MemoryError: the device's memory does not suffice for one sample.
+        """
+        seconds = 0.0
+        if self._to_be_found:
+            with torch.compiler.set_stance("force_eager"):  # it would compile for every size that is tried
+                self.micro_batch.size, seconds = self._find_micro_batch(size)
+            self._to_be_found = False
+        peak, last = measure(
+            lambda: self.micro_batch.run(lambda part: self._try(part.stop - part.start, size), self.micro_batch.size), self.device
+        )
+        if peak is not None:
+            peak += weight_bytes(self._unet, self._autoencoder)
+        what = f"inpainting {self.network.name} at {size[0]}x{size[1]}, {self.dtype}"
+        return WarmUp(what, self.micro_batch.size, peak, seconds + last)
+
+    def _find_micro_batch(self, size: tuple[int, int]) -> tuple[int, float]:
+        """The largest micro-batch within the budget, and the seconds that finding it took."""
+        weights = weight_bytes(self._unet, self._autoencoder)
+        allowed = self.network.memory_gib
+        budget = int(AUTO_SHARE * free_bytes(self.device)) if allowed is None else int(allowed * GIB) - weights
+        spent = 0.0
+
+        def peak_bytes(samples: int) -> int:
+            nonlocal spent
+            try:
+                peak, seconds = measure(lambda: self._try(samples, size), self.device)
+            except torch.OutOfMemoryError:
+                if samples == 1:
+                    return 0  # the warm-up that follows says it
+                return MANY
+            spent += seconds
+            return peak or 0
+
+        return largest_micro_batch(peak_bytes, budget), spent
+
+    def _try(self, samples: int, size: tuple[int, int]) -> None:
+        right = torch.zeros(samples, 3, *size, device=self.device)
+        inpaint_mask = torch.ones(samples, 1, *size, dtype=torch.bool, device=self.device)
+        self._inpaint(right, inpaint_mask, torch.zeros(samples, *_latent_shape(right)), TRIAL_STEPS)
 
     @torch.no_grad()
-    def _decoded(self, right: Tensor, inpaint_mask: Tensor, noise: Tensor) -> Tensor:
+    def _inpaint(self, right: Tensor, inpaint_mask: Tensor, noise: Tensor, most_steps: int | None = None) -> Tensor:
         height, width = right.shape[-2:]
         generators = [torch.Generator().manual_seed(crc32(sample.numpy().tobytes())) for sample in noise.float().cpu()]
         right, inpaint_mask, noise = (tensor.to(self.device) for tensor in (right, inpaint_mask, noise.float()))
@@ -149,25 +170,37 @@ class DiffusionInpainter:
         with torch.autocast(self.device.type, enabled=False):
             masked = (right.float() / 127.5 - 1).masked_fill(inpaint_mask, 0)
             masked = F.pad(masked, (0, -width % CELL_PX, 0, -height % CELL_PX), mode="replicate")
-            latents = self._denoise(noise, latent_mask(inpaint_mask), self._encode(masked), generators)
-            decoded = self._autoencoder.decode(latents.to(self.dtype) / self._autoencoder.config.scaling_factor).sample
-        return (decoded[..., :height, :width].float().clamp(-1, 1) + 1) * 127.5
+            latents = self._denoise(noise, latent_mask(inpaint_mask), self._encode(masked), generators, most_steps)
+            decoded = self._decode(latents)
+        return (decoded[..., :height, :width].clamp(-1, 1) + 1) * 127.5
 
     def _encode(self, images: Tensor) -> Tensor:
-        encoded = self._autoencoder.encode(images.to(self.dtype))
-        latents = encoded.latent_dist.mean if hasattr(encoded, "latent_dist") else encoded.latents  # a tiny autoencoder has no distribution
-        return latents * self._autoencoder.config.scaling_factor
+        """Images in -1..1 to latents: the mean of the encoder's distribution."""
+        made = [self._autoencoder.encode(part) for part in images.to(self.dtype).split(AUTOENCODER_BATCH)]
+        # A tiny autoencoder has no distribution.
+        latents = [encoded.latent_dist.mean if hasattr(encoded, "latent_dist") else encoded.latents for encoded in made]
+        return torch.cat(latents) * self._autoencoder.config.scaling_factor
 
-    def _denoise(self, noise: Tensor, mask: Tensor, masked_latents: Tensor, generators: list[torch.Generator]) -> Tensor:
+    def _decode(self, latents: Tensor) -> Tensor:
+        """Latents to float32 images in about -1..1."""
+        latents = latents.to(self.dtype) / self._autoencoder.config.scaling_factor
+        return torch.cat([self._autoencoder.decode(part).sample.float() for part in latents.split(AUTOENCODER_BATCH)])
+
+    def _denoise(
+        self, noise: Tensor, mask: Tensor, masked_latents: Tensor, generators: list[torch.Generator], most_steps: int | None
+    ) -> Tensor:
         scheduler, dtype = deepcopy(self._scheduler), self.dtype  # a scheduler remembers what it has seen; each run begins with a fresh one
         options = {"generator": generators} if "generator" in inspect.signature(scheduler.step).parameters else {}
         prompt = self._prompt.expand(len(noise), -1, -1)
         beside = torch.cat([mask.to(dtype), masked_latents.to(dtype)], dim=1)
         latents = noise * scheduler.init_noise_sigma
-        for timestep, timestep_on_device in zip(scheduler.timesteps, scheduler.timesteps.to(self.device), strict=True):
+        timesteps = scheduler.timesteps[:most_steps]
+        for timestep, timestep_on_device in zip(timesteps, timesteps.to(self.device), strict=True):
             noisy = torch.cat([scheduler.scale_model_input(latents, timestep).to(dtype), beside], dim=1)
-            predicted = self._unet(noisy, timestep_on_device, encoder_hidden_states=prompt).sample
-            latents = scheduler.step(predicted.float(), timestep, latents, **options).prev_sample
+            if self.network.compile:
+                torch.compiler.cudagraph_mark_step_begin()  # what the graph returned before may be overwritten now
+            predicted = self._unet(noisy, timestep_on_device, encoder_hidden_states=prompt).sample.to(torch.float32, copy=True)
+            latents = scheduler.step(predicted, timestep, latents, **options).prev_sample
         return latents
 
 
@@ -194,37 +227,3 @@ def _check(right: Tensor, inpaint_mask: Tensor) -> None:
     if inpaint_mask.dtype != torch.bool or inpaint_mask.shape != (len(right), 1, *right.shape[-2:]):
         expected = [len(right), 1, *right.shape[-2:]]
         raise ValueError(f"inpaint_mask must be bool {expected}; got {inpaint_mask.dtype} {list(inpaint_mask.shape)}")
-
-
-def _dtype(dtype: torch.dtype | str | None, device: torch.device) -> torch.dtype:
-    if dtype is None:
-        if device.type != "cuda":
-            return torch.float32
-        with torch.cuda.device(device):
-            return torch.bfloat16 if torch.cuda.is_bf16_supported(including_emulation=False) else torch.float16
-    named = DTYPES.get(dtype) if isinstance(dtype, str) else dtype
-    if named is None or named not in DTYPES.values():
-        raise ValueError(f"dtype is one of {', '.join(DTYPES)}; got {dtype}")
-    return named
-
-
-def _scheduler(name: str, config: Mapping[str, Any], steps: int) -> Any:
-    """The named scheduler, set to `steps`, with the noise schedule of `config`, whatever scheduler that was saved by."""
-    import diffusers
-
-    class_name = SCHEDULERS.get(name, name)
-    scheduler_class: Any = getattr(diffusers, class_name, None) if class_name.endswith("Scheduler") else None
-    if scheduler_class is None:
-        raise ValueError(f'scheduler is one of {", ".join(SCHEDULERS)} or a scheduler class of diffusers by name; got "{name}"')
-    options = inspect.signature(scheduler_class.__init__).parameters
-    step = inspect.signature(getattr(scheduler_class, "step", scheduler_class)).parameters
-    inputs = [key for key, value in step.items() if value.default is value.empty]
-    if "beta_schedule" not in options or inputs != ["self", "model_output", "timestep", "sample"]:
-        raise ValueError(f'scheduler "{name}" is made for another kind of model: it does not denoise what this U-Net was trained on')
-    # Latents are not bounded by -1..1, but some schedulers clip to it unless told otherwise.
-    unclipped = {"clip_sample": False} if "clip_sample" in options else {}
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="__array", category=DeprecationWarning)  # what diffusers does to NumPy 2
-        scheduler = scheduler_class.from_config({**unclipped, **config})
-        scheduler.set_timesteps(steps)
-    return scheduler
