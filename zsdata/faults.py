@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections import Counter
-from collections.abc import Iterable
+from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 logger = logging.getLogger("zsdata")
@@ -48,9 +48,19 @@ class NoUsablePhoto(RuntimeError):
     """Neither a sample's photo nor any of its spares could be used."""
 
 
+class WorkerLost(RuntimeError):
+    """A worker process was killed, ended or hangs; the message names the process and the sample that it was at."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class FailureBudget:
-    """How many photos may be refused before the run stops: more than `count` of them and more than `rate` of all that were tried."""
+    """How many photos may be refused before the run stops: more than `count` of them, over all workers and ranks, and more than `rate` of
+    all that were tried.
+
+    Only the last RECENT_PHOTOS that a rank has tried count, so that a bucket which breaks after a good week is noticed as soon as one that
+    is broken from the start. Ranks do not ask each other: every rank may refuse its share of `count`. Samples are dealt out at random, so
+    faults fall on all ranks alike.
+    """
 
     count: int = 100
     rate: float = 0.1
@@ -60,35 +70,66 @@ class FailureBudget:
             raise ValueError(f"a budget is a count >= 0 and a rate in 0..1; got {self.count} and {self.rate}")
 
 
+RECENT_PHOTOS = 10_000  # or ten budgets, if that is more: so many that chance alone does not reach a rate that is well above the true one
+MOST_REASONS = 100  # counted apart; a reason that names numbers must not fill the memory
+OTHER_REASONS = "other reasons"
+
+
 class FaultLog:
-    """Counts what was refused, by reason, and stops the run once the budget is spent."""
+    """Counts what was refused, by reason, and stops the run once the budget is spent.
+
+    Args:
+        ranks: that share the budget's count.
+    """
 
     EXAMPLES = 20  # kept for the summary
+    LOG_LINES = 20  # at most, one for each reason
 
-    def __init__(self, budget: FailureBudget) -> None:
+    def __init__(self, budget: FailureBudget, ranks: int = 1) -> None:
         self._budget = budget
+        self._ranks = ranks
+        self._recent: deque[tuple[int, int]] = deque()  # (tried, refused)
+        self._tried = self._refused = 0
         self.made = 0
         self.by_reason: Counter[str] = Counter()
         self.examples: list[tuple[str, str, str, str]] = []
 
-    def add(self, made: int, rejected: Iterable[tuple[str, str, str, str]]) -> None:
-        """Counts `made` good samples and the refused photos: (source, shard, key, reason).
+    def add(self, made: int, rejected: Sequence[tuple[str, str, str, str]]) -> None:
+        """Counts `made` good samples and the photos refused on the way to them: (source, shard, key, reason).
 
         Raises:
             TooManyFaults: with a summary, once the budget is spent.
         """
         self.made += made
         for reject in rejected:
-            reason = reject[3].split(":")[0]
-            if not self.by_reason[reason]:
+            self._count(reject)
+        self._spend(made + len(rejected), len(rejected))
+
+    def _count(self, reject: tuple[str, str, str, str]) -> None:
+        reason = reject[3].split(":")[0]
+        if reason not in self.by_reason:
+            if len(self.by_reason) < self.LOG_LINES:
                 logger.warning('photo "%s" in %s skipped: %s (further ones of this kind are only counted)', reject[2], reject[1], reject[3])
-            self.by_reason[reason] += 1
-            if len(self.examples) < self.EXAMPLES:
-                self.examples.append(reject)
-        refused = self.by_reason.total()
-        if refused > self._budget.count and refused > self._budget.rate * (self.made + refused):
-            reasons = ", ".join(f"{reason}: {count}" for reason, count in self.by_reason.most_common())
+            elif len(self.by_reason) >= MOST_REASONS:
+                reason = OTHER_REASONS
+        self.by_reason[reason] += 1
+        if len(self.examples) < self.EXAMPLES:
+            self.examples.append(reject)
+
+    def _spend(self, tried: int, refused: int) -> None:
+        self._recent.append((tried, refused))
+        self._tried += tried
+        self._refused += refused
+        while self._tried - self._recent[0][0] >= max(RECENT_PHOTOS, 10 * self._budget.count):
+            tried, refused = self._recent.popleft()
+            self._tried -= tried
+            self._refused -= refused
+        if self._refused > self._budget.count / self._ranks and self._refused > self._budget.rate * self._tried:
+            reasons = ", ".join(f"{reason}: {count}" for reason, count in self.by_reason.most_common(10))
+            share = f", of which each of {self._ranks} ranks has its share" if self._ranks > 1 else ""
+            examples = "; ".join(f"{key} in {shard}: {reason}" for _, shard, key, reason in self.examples[:3])
             raise TooManyFaults(
-                f"{refused} of {self.made + refused} photos were refused ({reasons}), more than the failure budget allows "
-                f"({self._budget.count} and {self._budget.rate:.0%}); `zsdata verify` lists what is wrong with the shards"
+                f"{self._refused} of the last {self._tried} photos were refused, more than the failure budget allows "
+                f"({self._budget.count}{share}, and {self._budget.rate:.0%}). Refused since the start: {reasons}; the first: {examples}. "
+                "`zsdata verify` lists what is wrong with the shards"
             )

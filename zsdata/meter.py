@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import ClassVar
 
 
 class Meter:
     """Adds up how long each stage took; `seconds` maps stage to seconds."""
+
+    entered: ClassVar[Callable[[str], None] | None] = None  # in a worker process: is told of every stage that begins, of all meters
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -16,6 +19,8 @@ class Meter:
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Counts the time inside the `with` block."""
+        if Meter.entered is not None:
+            Meter.entered(name)
         start = time.perf_counter()
         try:
             yield

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
@@ -34,14 +35,13 @@ class Position:
             raise ValueError(f"a stream's state is a dictionary as state_dict() returns it; got {type(state).__name__}")
         names = {"version", *(field.name for field in fields(Position))}
         if state.keys() != names:
-            raise ValueError(
-                f"not a stream's state: missing {sorted(names - state.keys())}, unknown {sorted(map(str, state.keys() - names))}"
-            )
-        if state["version"] != VERSION:
+            unknown = reprlib.repr(sorted(map(str, state.keys() - names)))
+            raise ValueError(f"not a stream's state: missing {sorted(names - state.keys())}, unknown {unknown}")
+        if type(state["version"]) is not int or state["version"] != VERSION:
             raise ValueError(f"the state's version is {state['version']!r}; this zsdata reads version {VERSION}")
-        for name in ("epoch", "samples"):
-            if type(state[name]) is not int or state[name] < 0:
-                raise ValueError(f"the state's {name} must be an integer >= 0; got {state[name]!r}")
+        for name in ("seed", "epoch", "samples"):
+            if type(state[name]) is not int or not 0 <= state[name] < 2**63:
+                raise ValueError(f"the state's {name} must be an integer in 0..2^63 - 1; got {reprlib.repr(state[name])}")
         causes = {
             "seed": "the stream's seed differs",
             "manifest": "the photos, their order, the sources or epoch_size differ",
@@ -50,7 +50,7 @@ class Position:
         for name, cause in causes.items():
             if state[name] != getattr(expected, name):
                 raise ValueError(
-                    f"the state's {name} is {state[name]!r}, this stream's is {getattr(expected, name)!r}: {cause}. "
+                    f"the state's {name} is {reprlib.repr(state[name])}, this stream's is {getattr(expected, name)!r}: {cause}. "
                     "Open the stream as it was when the state was saved, or start anew without it."
                 )
         return Position(**{name: state[name] for name in names - {"version"}})
