@@ -20,6 +20,7 @@ from zsdata.stream import ZeroStereoStream
 from zsdata.worker import single_thread
 
 WORKER_STAGES = ("read", "decode", "view", "depth", "disparity", "sharpen", "warp", "background")
+DRAFT_STAGES = ("read", "decode", "view", "background")  # what is left of them where depth is the training device's work
 FINISH_STAGES = ("transfer", "inpaint", "augment")
 REST = "rest"  # of a process's time: bookkeeping, copies, collation
 BOUND_BY_WORKERS = 0.25  # share of its time that the training process waits for them; below it more of them would gain little
@@ -33,6 +34,7 @@ class Run:
         seconds: of `pairs`, by the clock.
         stages: seconds by stage, as `StereoLoader.stats` has them: those of the workers added up over all of them.
         ready_batches: prepared batches that lay ready when one was asked for, on average.
+        depth_on_device: the training process estimates depth and warps, on its device.
     """
 
     workers: int
@@ -40,6 +42,7 @@ class Run:
     seconds: float
     stages: Mapping[str, float]
     ready_batches: float
+    depth_on_device: bool = False
 
     @property
     def pairs_per_second(self) -> float:
@@ -158,9 +161,10 @@ def feed(
             seconds += time.perf_counter() - start
             after_batch(batch)
         after = loader.stats()
+        depth_on_device = loader._finisher.synthesis is not None
     ready = after["ready_batches"] * after["batches"] - before["ready_batches"] * before["batches"]
     stages = {name: value - before["seconds"].get(name, 0.0) for name, value in after["seconds"].items()}
-    return Run(workers, batches * batch_size, seconds, stages, ready / batches)
+    return Run(workers, batches * batch_size, seconds, stages, ready / batches, depth_on_device)
 
 
 def split_stages(run: Run, device: torch.device) -> tuple[dict[str, float], dict[str, float]]:
@@ -171,8 +175,10 @@ def split_stages(run: Run, device: torch.device) -> tuple[dict[str, float], dict
         return {**stages, REST: max(0.0, 1e3 * seconds / run.pairs - sum(stages.values()))}
 
     finishing = run.seconds - run.stages["wait"]
-    worker_ms = of(WORKER_STAGES, run.stages["wait"])
-    return worker_ms, of(FINISH_STAGES, finishing) if device.type == "cpu" else {f"finish on {device.type}": 1e3 * finishing / run.pairs}
+    of_worker = DRAFT_STAGES if run.depth_on_device else WORKER_STAGES
+    of_finish = tuple(name for name in WORKER_STAGES if name not in of_worker) + FINISH_STAGES
+    worker_ms = of(of_worker, run.stages["wait"])
+    return worker_ms, of(of_finish, finishing) if device.type == "cpu" else {f"finish on {device.type}": 1e3 * finishing / run.pairs}
 
 
 def fill_depth_cache(stream: ZeroStereoStream, workers: int, samples: int) -> None:
@@ -201,7 +207,8 @@ def advice(report: BenchReport, *, device: str | torch.device, cores: int, depth
             + (
                 "Finish the batches on a GPU (--device cuda), and leave the CPU to the workers."
                 if where == "cpu"
-                else "Its work is done on the GPU already: take a cheaper inpainter, or leave it at this rate if training is slower."
+                else "That is the GPU's work: take a faster inpainter"
+                + (", or keep depth on disk (--depth-cache DIR)." if run.depth_on_device and not depth_cached else ".")
             )
         )
     if not run.workers:

@@ -403,14 +403,15 @@ def _export(options: argparse.Namespace) -> int:
 def _bench(options: argparse.Namespace) -> int:
     shards = expand_urls(options.sources)
     device = _device(options.device)
-    depth = load_depth(options.depth)
+    load_depth(options.depth)  # what is wrong with it is told first; training is given the name, and every worker loads its own
+    inpainter = load_inpainter(options.inpaint, device)
     samples = samples_needed(options.workers, batch_size=options.batch_size, pairs=options.pairs)
 
-    def stream_with(inpaint: Inpainter | str, augmentation: AugmentConfig | None) -> ZeroStereoStream:
+    def stream_with(inpaint: Inpainter, augmentation: AugmentConfig | None) -> ZeroStereoStream:
         return ZeroStereoStream(
             shards,
             size=tuple(options.size),
-            depth=depth if options.depth_cache is None else options.depth,  # the cache knows estimators by name
+            depth=options.depth,
             inpaint=inpaint,
             seed=options.seed,
             epoch_size=samples,
@@ -419,7 +420,7 @@ def _bench(options: argparse.Namespace) -> int:
             augmentation=augmentation,
         )
 
-    stream = stream_with(options.inpaint, None)
+    stream = stream_with(inpainter, None)
     if options.depth_cache is not None:
         fill_depth_cache(stream_with(leave_holes, AugmentConfig.none()), max(options.workers), samples)
     report = bench(stream, options.workers, batch_size=options.batch_size, pairs=options.pairs, device=device)
