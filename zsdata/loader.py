@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -9,17 +11,22 @@ from typing import Any
 import cv2
 import torch
 from accelerate.state import GradientState
-from torch.utils.data import DataLoader, Dataset
 
 from zsdata.faults import FailureBudget, FaultLog
 from zsdata.finish import Finisher
 from zsdata.meter import Meter
+from zsdata.pool import Job, WorkerPool
 from zsdata.position import Position
+from zsdata.prepared import Prepared, stack
+from zsdata.rejected import RejectedFile
 from zsdata.sample import StereoBatch
 from zsdata.synthesis.depth.builtin import BuiltinDepthWarning
-from zsdata.worker import Prepared, Worker
+from zsdata.worker import Worker
+
+logger = logging.getLogger("zsdata")
 
 PREFETCHED_BATCHES = 2  # per worker, ready or in the making
+SAMPLE_TIMEOUT_SECONDS = 300.0  # the largest depth networks take a minute and more for a large photo on one thread
 
 
 class StereoLoader:
@@ -48,6 +55,8 @@ class StereoLoader:
         rank: int,
         world_size: int,
         multiprocessing_context: str | None,
+        timeout_seconds: float = SAMPLE_TIMEOUT_SECONDS,
+        rejected: str | os.PathLike[str] | None = None,
     ) -> None:
         if batch_size < 1:
             raise ValueError(f"batch_size is 1 or more; got {batch_size}")
@@ -55,6 +64,8 @@ class StereoLoader:
             raise ValueError(f"num_workers is 0 or more; got {num_workers}")
         if not 0 <= rank < world_size:
             raise ValueError(f"rank is in 0..world_size - 1; got rank {rank} of {world_size}")
+        if not timeout_seconds > 0:
+            raise ValueError(f"timeout_seconds is above 0; got {timeout_seconds}")
         self.batch_size = batch_size
         self.rank = rank
         self.world_size = world_size
@@ -66,10 +77,12 @@ class StereoLoader:
         self._epoch_size = epoch_size
         self._num_workers = num_workers
         self._context = multiprocessing_context
+        self._timeout_seconds = timeout_seconds
         self._epoch = 0
         self._samples = 0
         self._pipeline: _Pipeline | None = None
-        self._faults = FaultLog(budget)
+        self._faults = FaultLog(budget, ranks=world_size)
+        self._rejected = None if rejected is None else RejectedFile(rejected)
         self._problems = problems
         self._meter = Meter()
         self._batches = 0
@@ -108,8 +121,12 @@ class StereoLoader:
                 yield batch
                 if last or self._epoch != epoch:
                     return
-        except Exception:
-            self.close()  # what was prefetched no longer follows the place
+        except GeneratorExit:
+            raise
+        except BaseException as error:  # KeyboardInterrupt too: what was prefetched no longer follows the place
+            self.close()
+            if self.world_size > 1 and isinstance(error, Exception):
+                logger.error("rank %d of %d stops: %s: %s", self.rank, self.world_size, type(error).__name__, error)
             raise
         finally:
             gradient_state._remove_dataloader(self)
@@ -128,6 +145,8 @@ class StereoLoader:
             ValueError: for a state of another stream; it names the field that differs.
         """
         place = Position.from_state(state, self._place())
+        if place.samples > self._epoch_size(place.epoch):
+            raise ValueError(f"the state's samples is {place.samples}, but epoch {place.epoch} has only {self._epoch_size(place.epoch)}")
         self.close()
         self._epoch, self._samples = place.epoch, place.samples
         if not self._left(self._epoch, self._samples):  # a larger batch no longer fits into the rest of the epoch
@@ -137,9 +156,9 @@ class StereoLoader:
         """What this rank has seen so far.
 
         `batches`, `pairs`; `ready_batches`: how many prepared batches lay ready when one was asked for, on average; `rejected`: photos
-        refused, by reason; `examples`: (source, shard, key, reason) of the first ones; `shard_problems`: faults of the shards themselves,
-        by reason; `seconds`: time by stage, those of the workers added up over all of them, "wait" being how long the training process
-        stood still for lack of a prepared batch.
+        that this rank refused, by reason; `examples`: (source, shard, key, reason) of the first ones; `shard_problems`: faults of the
+        shards themselves, by reason; `seconds`: time by stage, those of the workers added up over all of them, "wait" being how long the
+        training process stood still for lack of a prepared batch.
         """
         return {
             "batches": self._batches,
@@ -184,7 +203,13 @@ class StereoLoader:
             self.close()  # the sources were swapped: what was prefetched may no longer be what the plan says
         if self._pipeline is None:
             self._pipeline = _Pipeline(
-                self._worker, self._requests(self._epoch, self._samples), self._num_workers, self.device, self._context, self._revision()
+                self._worker,
+                self._requests(self._epoch, self._samples),
+                self._num_workers,
+                self.device,
+                self._context,
+                self._timeout_seconds,
+                self._revision(),
             )
         self._ready += self._pipeline.ready
         prepared = next(self._pipeline)
@@ -192,6 +217,8 @@ class StereoLoader:
         if [(meta["epoch"], meta["index"]) for meta in prepared.meta] != [(self._epoch, index) for index in expected]:
             raise RuntimeError(f"expected samples {expected} of epoch {self._epoch}, got {prepared.meta}")
         self._meter.add(prepared.seconds)
+        if self._rejected is not None:
+            self._rejected.add(prepared.meta)
         self._faults.add(len(prepared.meta), prepared.rejected)
         return prepared
 
@@ -200,27 +227,16 @@ class StereoLoader:
         return list(range(first, first + self.batch_size))
 
     def _requests(self, epoch: int, samples: int) -> Iterator[list[tuple[int, int]]]:
-        """All batches of this rank from a place on, without end."""
-        while True:
+        """All batches of this rank from a place on, as far as every epoch has one."""
+        while self._left(epoch, samples):
             while self._left(epoch, samples):
                 yield [(epoch, index) for index in self._indices(samples)]
                 samples += self._global_batch
             epoch, samples = epoch + 1, 0
-            self._check_epoch(epoch)
-
-
-class _Samples(Dataset):
-    """What a DataLoader needs to know of a worker: (epoch, index) in, a prepared sample out."""
-
-    def __init__(self, worker: Worker) -> None:
-        self._worker = worker
-
-    def __getitem__(self, request: tuple[int, int]) -> Prepared:
-        return self._worker.prepare(*request)
 
 
 class _Pipeline:
-    """Prepared batches in the order of the requests; torch's DataLoader does the plumbing between the processes."""
+    """Prepared batches in the order of the requests, made by worker processes or, without any, in this one."""
 
     def __init__(
         self,
@@ -229,48 +245,40 @@ class _Pipeline:
         num_workers: int,
         device: torch.device,
         context: str | None,
+        timeout_seconds: float,
         revision: int,
     ) -> None:
         self.revision = revision
-        self._num_workers = num_workers
-        several: dict[str, Any] = {}
+        self._pool: WorkerPool | None = None
+        self._pin = device.type == "cuda"
         if num_workers:
-            several = {
-                "prefetch_factor": PREFETCHED_BATCHES,
-                "multiprocessing_context": context,
-                "worker_init_fn": _start_worker,
-            }
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "This DataLoader will create")  # how many processes to start is the user's decision
-            loader = DataLoader(
-                _Samples(worker),
-                batch_sampler=requests,  # type: ignore[arg-type]  # any iterable of lists of what the dataset is asked for
-                num_workers=num_workers,
-                collate_fn=Prepared.stack,
-                pin_memory=device.type == "cuda",
-                **several,
+            self._pool = WorkerPool(
+                Job(_start_worker, worker.prepare, stack),
+                requests,
+                processes=num_workers,
+                ahead=PREFETCHED_BATCHES,
+                context=context,
+                timeout_seconds=timeout_seconds,
             )
-            self._batches: Any = iter(loader)
+            self._batches: Iterator[Any] = self._pool
+        else:
+            self._batches = (stack([worker.prepare(*sample) for sample in request]) for request in requests)
 
-    def __next__(self) -> Prepared:
-        return next(self._batches)
+    def __next__(self) -> Any:
+        prepared = next(self._batches)
+        return prepared.pin_memory() if self._pin else prepared
 
     @property
     def ready(self) -> int:
         """Prepared batches that wait to be taken."""
-        if not self._num_workers:
-            return 0
-        set_aside = sum(len(task) == 2 for task in self._batches._task_info.values())  # (worker, batch): it overtook the one before it
-        return self._batches._data_queue.qsize() + set_aside
+        return 0 if self._pool is None else self._pool.ready
 
     def close(self) -> None:
-        shutdown = getattr(self._batches, "_shutdown_workers", None)
-        if shutdown is not None:
-            shutdown()
+        if self._pool is not None:
+            self._pool.close()
 
 
-def _start_worker(worker_id: int) -> None:
-    del worker_id
+def _start_worker() -> None:
     warnings.simplefilter("ignore", BuiltinDepthWarning)  # the process that opened the stream has said it
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
