@@ -55,8 +55,8 @@ class StereoLoader:
         rank: int,
         world_size: int,
         multiprocessing_context: str | None,
-        timeout_seconds: float = SAMPLE_TIMEOUT_SECONDS,
-        rejected: str | os.PathLike[str] | None = None,
+        timeout_seconds: float,
+        rejected: str | os.PathLike[str] | None,
     ) -> None:
         if batch_size < 1:
             raise ValueError(f"batch_size is 1 or more; got {batch_size}")
@@ -217,9 +217,10 @@ class StereoLoader:
         if [(meta["epoch"], meta["index"]) for meta in prepared.meta] != [(self._epoch, index) for index in expected]:
             raise RuntimeError(f"expected samples {expected} of epoch {self._epoch}, got {prepared.meta}")
         self._meter.add(prepared.seconds)
+        firsts = [meta for meta in prepared.meta if meta["index"] == meta["pair"]]  # samples that reuse a pair refused nothing anew
         if self._rejected is not None:
-            self._rejected.add(prepared.meta)
-        self._faults.add(len(prepared.meta), prepared.rejected)
+            self._rejected.add(firsts)
+        self._faults.add(len(prepared.meta), [tuple(reject) for meta in firsts for reject in meta["replaced"]])
         return prepared
 
     def _indices(self, samples: int) -> list[int]:

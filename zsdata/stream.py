@@ -17,7 +17,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 from zsdata.augment import AugmentConfig
 from zsdata.faults import FailureBudget, FaultLog
 from zsdata.finish import Finisher, Synthesis
-from zsdata.loader import StereoLoader
+from zsdata.loader import SAMPLE_TIMEOUT_SECONDS, StereoLoader
 from zsdata.meter import Meter
 from zsdata.position import Position
 from zsdata.prepared import Draft, Prepared, stack
@@ -198,6 +198,8 @@ class ZeroStereoStream(IterableDataset):
         world_size: int = 1,
         micro_batch: int = 8,
         multiprocessing_context: str | None = None,
+        timeout_seconds: float = SAMPLE_TIMEOUT_SECONDS,
+        rejected: str | os.PathLike[str] | None = None,
     ) -> StereoLoader:
         """Finished batches on `device`, made ahead by `num_workers` processes.
 
@@ -208,6 +210,10 @@ class ZeroStereoStream(IterableDataset):
             rank, world_size: which share of every global batch this process is given.
             micro_batch: pairs that are inpainted at once; changes memory and speed, never a picture.
             multiprocessing_context: "fork", "forkserver" or "spawn"; None is Python's own choice.
+            timeout_seconds: the most that a worker may take over one sample before it counts as hung. One that is killed, ends, is stopped
+                or sleeps is noticed within 10 s; only an endless loop, which looks like work, is given this long.
+            rejected: a file that gets a line of JSON for every photo that was refused: source, shard, key, reason, epoch, index. It is
+                appended to, and ranks may share it.
         """
         if micro_batch < 1:
             raise ValueError(f"micro_batch is 1 or more; got {micro_batch}")
@@ -230,6 +236,8 @@ class ZeroStereoStream(IterableDataset):
             rank=rank,
             world_size=world_size,
             multiprocessing_context=multiprocessing_context,
+            timeout_seconds=timeout_seconds,
+            rejected=rejected,
         )
 
     def state_dict(self) -> dict[str, Any]:
