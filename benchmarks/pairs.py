@@ -9,10 +9,10 @@ Real photos, cut to 4:3, resized to each size and stored as JPEG; the finished p
 `zsdata export` writes them. "Reading" takes their six files from the system's memory; see published_set.py for the augmentation. A pair is
 a crop of 384x512, its depth comes from the cache, and everything runs on one thread but for the tables with workers.
 
-What is compared is measured in turn, photo by photo, and by the time that the thread itself was on a processor, so that a busy machine
-disturbs both alike, and little. Milliseconds are medians over rounds of the mean over the photos, ratios are medians over rounds of the
-ratio in one round. "Decodes": how often OpenCV decodes the same photo's JPEG meanwhile. Pairs per second go by the clock on the wall: on a
-busy machine they are fewer.
+What is compared is measured in turn, over all photos each, round after round, and by the time that the thread itself was on a processor,
+so that a busy machine disturbs both alike, and little. Milliseconds are medians over rounds of the mean over the photos, ratios are medians
+over rounds of the ratio in one round. "Decodes": how often OpenCV decodes the same photo's JPEG meanwhile. Pairs per second go by the clock
+on the wall: on a busy machine they are fewer.
 """
 
 from __future__ import annotations
@@ -110,15 +110,16 @@ def to_jpeg(picture: np.ndarray, size: tuple[int, int]) -> bytes:
 
 
 def in_turn(work: Mapping[str, Callable[[int, int], object]], photos: int, rounds: int, title: str) -> Times:
-    """Takes the time of each kind of work on each photo, one after the other, round after round; `work` takes round and photo.
+    """Takes the time of each kind of work on all photos, one kind after the other, round after round; `work` takes round and photo.
 
-    What it returns as a dictionary counts as the seconds of its parts, "NAME: PART".
+    One kind goes over all photos in a row, as a worker does, so that the processor's caches are its own. What it returns as a dictionary
+    counts as the seconds of its parts, "NAME: PART".
     """
     times: dict[str, np.ndarray] = {}
-    with tqdm(total=rounds * photos, desc=title, disable=None, leave=False) as bar, stages_by_thread_time():
+    with tqdm(total=rounds * len(work), desc=title, disable=None, leave=False) as bar, stages_by_thread_time():
         for number in range(rounds):
-            for photo in range(photos):
-                for name, do in work.items():
+            for name, do in work.items():
+                for photo in range(photos):
                     start = time.thread_time()
                     parts = do(number, photo)
                     seconds = {name: time.thread_time() - start}
