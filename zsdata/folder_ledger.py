@@ -1,8 +1,8 @@
 """How many bytes a cache's folder holds: one number for all processes, in a small file that is also their lock.
 
 The number may be too high (after a process was killed), never too low: it grows before a file does, and shrinks after one is gone.
-Only files with names of ours are counted or removed. Of what kind the cache is ("depth", "shard"), is part of these names, so that caches of
-two kinds may share a folder.
+Only files with names of ours are counted or removed. The kind of the cache ("depth", "shard") is part of these names, so that caches of two
+kinds may share a folder.
 """
 
 from __future__ import annotations

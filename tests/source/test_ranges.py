@@ -6,7 +6,7 @@ import fsspec
 import pytest
 
 from zsdata.faults import BadShard
-from zsdata.source import ranges
+from zsdata.source import fsspec_ranges
 from zsdata.source.ranges import ShardFile, read_range
 
 
@@ -64,7 +64,7 @@ def test_a_missing_package_is_named_with_its_cure(monkeypatch):
     def missing(url):
         raise ImportError("Install s3fs to access S3")
 
-    monkeypatch.setattr(ranges, "url_to_fs", missing)
+    monkeypatch.setattr(fsspec_ranges, "url_to_fs", missing)
     with pytest.raises(ImportError, match=r's3://b/s.tar: Install s3fs.*pip install "zsdata\[remote\]"'):
         ShardFile("s3://b/s.tar")
 

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import glob
 import os
+import re
 from collections.abc import Sequence
+from urllib.parse import urlsplit
 
 import fsspec
 from braceexpand import braceexpand
+
+HTTP = ("http", "https")  # the protocols that are spoken here; fsspec speaks the others
 
 
 def local_path(url: str) -> str | None:
@@ -22,6 +26,22 @@ def base_name(url: str) -> str:
     if url.startswith(("http://", "https://")):
         url = url.split("?", 1)[0].split("#", 1)[0]
     return url.rstrip("/").rpartition("/")[2]
+
+
+def shown_url(url: str) -> str:
+    """A url as it may stand in a message: without user, password and the query of an http address, which may hold a token."""
+    protocol, separator, rest = url.partition("://")
+    if not separator:
+        return url
+    if protocol in HTTP:
+        rest = re.split(r"[?#]", rest, maxsplit=1)[0]
+    host, slash, path = rest.partition("/")
+    return f"{protocol}://{host.rpartition('@')[2]}{slash}{path}"
+
+
+def without_secrets(text: str) -> str:
+    """Another's message, with the urls in it as `shown_url` gives them."""
+    return re.sub(r"\b[a-z][a-z0-9+.-]*://[^\s'\"<>)]+", lambda found: shown_url(found[0]), text)
 
 
 def expand_urls(urls: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) -> list[str]:
@@ -48,7 +68,7 @@ def expand_urls(urls: str | os.PathLike[str] | Sequence[str | os.PathLike[str]])
         path = local_path(url)
         identity = url if path is None else os.path.realpath(path)
         if identity in seen:
-            raise ValueError(f"{url} is named twice; each shard may be in a source once (weights make photos more frequent)")
+            raise ValueError(f"{shown_url(url)} is named twice; each shard may be in a source once (weights make photos more frequent)")
         seen.add(identity)
     return expanded
 
@@ -68,9 +88,10 @@ def _expand_one(spec: str) -> list[str]:
     for url in names:
         if url.startswith("pipe:"):
             raise ValueError(
-                f"{url!r}: pipe: urls run shell commands and are refused; name the tar itself (a path, http, s3, gs or hf url)"
+                f"{url!r}: pipe: urls run shell commands, and what comes out of a pipe cannot be read by range: they are always refused; "
+                "name the tar itself (a path, http, s3, gs or hf url)"
             )
-        if "::" in url:
+        if "::" in url and url.split("://", 1)[0] not in HTTP:  # [::1] is a host
             raise ValueError(f'{url!r}: "::" is not supported; give a list of urls, or for chained file systems the url of the tar itself')
         path = local_path(url)
         shards += _remote_shards(url, spec) if path is None else _local_shards(path, url, spec)
@@ -79,15 +100,30 @@ def _expand_one(spec: str) -> list[str]:
 
 def _remote_shards(url: str, spec: str) -> list[str]:
     protocol = url.split("://", 1)[0]
+    if "*" in url.split("?", 1)[0]:
+        raise ValueError(
+            f'{shown_url(spec)!r}: globs find local shards only; name remote ones with braces, as in "{protocol}://.../{{000..099}}.tar"'
+        )
+    if protocol in HTTP:
+        _check_http(url)
+        return [url]
     try:
         fsspec.get_filesystem_class(protocol)
     except ImportError:  # known, but its package is missing: an error when a shard is opened
         pass
     except ValueError as error:
         raise ValueError(f"{spec!r}: {protocol}:// is no kind of url that fsspec knows; use http, https, s3, gs, hf or a path") from error
-    if "*" in url:
-        raise ValueError(f'{spec!r}: globs find local shards only; name remote ones with braces, as in "{protocol}://.../{{000..099}}.tar"')
     return [url]
+
+
+def _check_http(url: str) -> None:
+    try:
+        parts = urlsplit(url)
+        whole = bool((parts.hostname or "").encode("idna")) and (parts.port is None or parts.port > 0)
+    except ValueError:
+        whole = False
+    if not whole:
+        raise ValueError(f'{shown_url(url)!r} has no host, or no port that exists; an address is written as in "https://host/shard.tar"')
 
 
 def _local_shards(path: str, url: str, spec: str) -> list[str]:
