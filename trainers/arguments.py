@@ -7,10 +7,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from trainers.loop import LossFunction, TrainConfig, train
 from trainers.models import Matcher, load_checkpoint
-from trainers.pairs_on_disk import StereoPair, find_pairs, motorcycle, read_pair
 from trainers.ranks import start_missing_ranks
+from trainers.scores import METRICS
+from trainers.step_guard import TrainingDiverged
+from trainers.training_loss import LOSSES
+from trainers.validation import EvaluationSet
 from zsdata import AdaptiveDisparity, AugmentConfig, ImageSource, SynthesisConfig, UniformDisparity, ZeroStereoStream
 from zsdata.faults import NoUsablePhoto, TooManyFaults
 
@@ -45,7 +50,10 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
     )
     stream.add_argument("--depth", default="builtin", help='"builtin", or a Hub id or folder in the transformers format (default: builtin)')
     stream.add_argument(
-        "--inpaint", default="builtin", help='"builtin", "background", or a Hub id or folder in the diffusers format (default: builtin)'
+        "--inpaint",
+        default="builtin",
+        help='"builtin", "background" (another photo, as in MfS-Stereo), "none" (black), or a Hub id or folder in the diffusers format '
+        "(default: builtin)",
     )
     stream.add_argument(
         "--disparity", choices=("adaptive", "uniform"), default="adaptive", help="the paper's ADS, or MfS-Stereo's uniform range"
@@ -69,26 +77,57 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
     training.add_argument(
         "--learning-rate", type=float, default=defaults.learning_rate, help=f"peak of the one-cycle (default: {defaults.learning_rate})"
     )
+    training.add_argument(
+        "--loss",
+        choices=list(LOSSES),
+        default="zero",
+        help="the paper's, or one of its ablations: "
+        + "; ".join(f"{name} is {words}" for name, words in LOSSES.items())
+        + " (default: zero)",
+    )
     training.add_argument("--mixed-precision", choices=("no", "bf16", "fp16"), help="default: what `accelerate launch` was told")
+    training.add_argument("--compile", action="store_true", help="torch.compile the encoders and the update; the first step takes minutes")
+    training.add_argument("--channels-last", action="store_true", help="store images as tensor cores take them")
+    training.add_argument(
+        "--ema", type=float, metavar="DECAY", help="save and judge a moving average of the weights, such as 0.999 (default: none)"
+    )
     training.add_argument(
         "--initial-weights", type=Path, metavar="FILE", help="a published or own checkpoint to start from (.pth or .safetensors)"
     )
-    training.add_argument("--output", type=Path, required=True, metavar="DIR", help="the run's folder: checkpoints, logs, evaluation.json")
+    training.add_argument(
+        "--output", type=Path, required=True, metavar="DIR", help="the run's folder: checkpoints, best, logs, evaluations"
+    )
     training.add_argument(
         "--resume", type=Path, metavar="DIR", help="go on from the newest checkpoint of that run, or from that checkpoint"
     )
     training.add_argument(
         "--save-every", type=int, default=defaults.save_every, help=f"steps between checkpoints (default: {defaults.save_every:,})"
     )
-    training.add_argument("--tracker", default="tensorboard", help='one of Accelerate\'s trackers, or "none" (default: tensorboard)')
+    training.add_argument(
+        "--tracker", default="tensorboard", help='one of Accelerate\'s trackers (wandb, mlflow, ...), or "none" (default: tensorboard)'
+    )
 
-    evaluation = parser.add_argument_group("the evaluation at the end")
+    evaluation = parser.add_argument_group("the evaluation, at the end and on the way")
     evaluation.add_argument(
         "--evaluate",
         nargs="+",
         default=[],
-        metavar="WHAT",
-        help='"motorcycle" (ships with scikit-image), or folders of stereo pairs with ground truth',
+        metavar="DATASET[=ROOT]",
+        help='"motorcycle" (ships with scikit-image), folders of stereo pairs with ground truth, or benchmarks such as kitti2015=DIR or '
+        "middlebury:F=DIR, as evaluate.py --help lists them with their variants",
+    )
+    evaluation.add_argument(
+        "--evaluate-every",
+        type=int,
+        metavar="N",
+        help="also every N steps, where a checkpoint is saved, too; OUTPUT/best is the best of them (default: at the end only)",
+    )
+    evaluation.add_argument(
+        "--best-by",
+        choices=list(METRICS),
+        default=defaults.best_by,
+        help="what tells the best checkpoint: over all pixels with ground truth, the mean over the pairs of a set and then over the sets "
+        f"(default: {defaults.best_by})",
     )
     evaluation.add_argument(
         "--evaluation-iterations", type=int, default=defaults.evaluation_iterations, help=f"default: {defaults.evaluation_iterations}"
@@ -106,7 +145,7 @@ def open_stream(arguments: argparse.Namespace) -> ZeroStereoStream:
         schedule,
         size=tuple(arguments.size),
         depth=arguments.depth,
-        inpaint=arguments.inpaint,
+        inpaint=leave_black if arguments.inpaint == "none" else arguments.inpaint,
         disparity=AdaptiveDisparity() if arguments.disparity == "adaptive" else UniformDisparity(),
         seed=arguments.seed,
         epoch_size=arguments.epoch_size,
@@ -126,18 +165,20 @@ def train_config(arguments: argparse.Namespace) -> TrainConfig:
         "accumulate",
         "workers",
         "mixed_precision",
+        "compile",
+        "channels_last",
+        "ema",
         "save_every",
+        "evaluate_every",
+        "best_by",
         "seed",
     )
     return TrainConfig(**{name: getattr(arguments, name) for name in names})
 
 
-def evaluation_pairs(arguments: argparse.Namespace) -> list[StereoPair]:
-    """The pairs of the final evaluation, read before the training so that a wrong path fails at once."""
-    pairs = []
-    for what in arguments.evaluate:
-        pairs += [motorcycle()] if what == "motorcycle" else [read_pair(folder) for folder in find_pairs(Path(what))]
-    return pairs
+def leave_black(right: Tensor, inpaint_mask: Tensor, generators: Any) -> Tensor:
+    """An inpainter that leaves the holes as the warp made them: black. No label leads there, and L_np leaves them out."""
+    return right
 
 
 def train_as_told(arguments: argparse.Namespace, matcher: Matcher, loss_function: LossFunction, name: str, options: dict[str, Any]) -> None:
@@ -145,6 +186,10 @@ def train_as_told(arguments: argparse.Namespace, matcher: Matcher, loss_function
     matcher.freeze_bn()
     if arguments.initial_weights is not None:
         load_checkpoint(matcher, arguments.initial_weights)
+    # Before the training, so that a wrong path fails at once.
+    sets = [EvaluationSet.parse(spec) for spec in arguments.evaluate]
+    if arguments.evaluate_every is not None and not sets:
+        raise ValueError("--evaluate-every needs --evaluate: what is to be judged on?")
     train(
         matcher,
         loss_function,
@@ -154,7 +199,7 @@ def train_as_told(arguments: argparse.Namespace, matcher: Matcher, loss_function
         model_config={"model": name, "options": options},
         arguments={argument: str(value) for argument, value in vars(arguments).items()},
         resume=arguments.resume,
-        pairs=evaluation_pairs(arguments),
+        sets=sets,
         tracker=None if arguments.tracker == "none" else arguments.tracker,
     )
 
@@ -164,7 +209,7 @@ def run(main: Any) -> None:
     try:
         start_missing_ranks()
         main()
-    except (ValueError, ImportError, OSError, NoUsablePhoto, TooManyFaults) as error:
+    except (ValueError, ImportError, OSError, MemoryError, NoUsablePhoto, TooManyFaults, TrainingDiverged) as error:
         sys.exit(f"{Path(sys.argv[0]).name}: {error}")
     except KeyboardInterrupt:
         sys.exit(130)

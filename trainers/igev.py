@@ -7,33 +7,14 @@ accelerate launch trainers/igev.py --sources photos.tar --output runs/first --re
 from __future__ import annotations
 
 import argparse
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
-from torch import Tensor
 
 from trainers.arguments import add_training_arguments, run, train_as_told
 from trainers.models.igev_stereo import IGEVStereo
 from trainers.models.mobilenet import load_imagenet_weights
-from zsdata import StereoBatch, zero_stereo_loss
-
-
-def sequence_loss(
-    initial: Tensor | None, sequence: list[Tensor], batch: StereoBatch, max_disparity: float
-) -> tuple[Tensor, dict[str, Any]]:
-    """The ZeroStereo loss over IGEV-Stereo's initial prediction and its sequence of updates."""
-    return zero_stereo_loss(
-        sequence,
-        batch.left_clean,
-        batch.right_clean,
-        batch.disparity,
-        batch.confidence,
-        batch.masks,
-        initial_prediction=initial,
-        max_disparity=max_disparity,
-    )
+from trainers.training_loss import TrainingLoss
 
 
 def main() -> None:
@@ -69,7 +50,7 @@ def main() -> None:
     matcher = IGEVStereo(**options)
     if arguments.backbone_weights is not None:
         load_imagenet_weights(matcher.feature, arguments.backbone_weights)
-    loss = partial(sequence_loss, max_disparity=arguments.max_supervised_disparity)
+    loss = TrainingLoss(name=arguments.loss, trusted=arguments.no_confidence, max_disparity=arguments.max_supervised_disparity)
     train_as_told(arguments, matcher, loss, "igev_stereo", options)
 
 

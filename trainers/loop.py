@@ -5,25 +5,33 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from accelerate import Accelerator
+from accelerate.tracking import GeneralTracker
 from torch import Tensor
 from tqdm import tqdm
 
 from trainers import run_folder
-from trainers.evaluate import evaluate, mean_scores, table
+from trainers.evaluate import mean_scores, table
 from trainers.models import Matcher, load_checkpoint
-from trainers.pairs_on_disk import StereoPair
+from trainers.provenance import provenance
+from trainers.ranks import mean_over_ranks
+from trainers.step_guard import StepGuard
+from trainers.validation import BEST_BY, EvaluationSet, Validation
+from trainers.weight_average import WeightAverage, weights_of
 from zsdata import StereoBatch, ZeroStereoStream
+from zsdata.metrics import reconstruction_error
 
 LossFunction = Callable[[Tensor | None, list[Tensor], StereoBatch], tuple[Tensor, dict[str, Any]]]
 
 LOG_EVERY_STEPS = 10
+RECONSTRUCT_EVERY_STEPS = 100  # how well the pairs and their labels fit together, into the log
 # RAFT-Stereo's schedule: a linear one-cycle that warms up for 1 % of the steps and is 100 steps longer than the training.
 WARM_UP_SHARE = 0.01
 SPARE_SCHEDULE_STEPS = 100
@@ -43,15 +51,23 @@ class TrainConfig:
     accumulate: int = 1  # batches per optimizer step
     workers: int = 4
     mixed_precision: str | None = None  # "no", "bf16", "fp16"; None takes what `accelerate launch` was told
+    compile: bool = False
+    channels_last: bool = False
+    ema: float | None = None  # decay of an average of the weights, which is then what is saved and judged
     save_every: int = 5_000
+    evaluate_every: int | None = None  # steps; None: at the end only
+    best_by: str = BEST_BY
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch_size", "iterations", "evaluation_iterations", "accumulate", "save_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is 1 or more; got {getattr(self, name)}")
+        for name in ("steps", "batch_size", "iterations", "evaluation_iterations", "accumulate", "save_every", "evaluate_every"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} is 1 or more; got {value}")
         if self.learning_rate <= 0 or self.clip_norm <= 0:
             raise ValueError(f"learning_rate and clip_norm are above 0; got {self.learning_rate} and {self.clip_norm}")
+        if self.ema is not None and not 0 < self.ema < 1:
+            raise ValueError(f"ema is a decay in (0, 1), such as 0.999; got {self.ema}")
 
 
 def train(
@@ -64,30 +80,43 @@ def train(
     model_config: dict[str, Any],
     arguments: dict[str, Any],
     resume: Path | None = None,
-    pairs: list[StereoPair] | None = None,
-    tracker: str | None = "tensorboard",
-) -> list[dict[str, Any]]:
-    """Trains `matcher` on the stream and returns its score on each of `pairs` (empty without pairs).
+    sets: Sequence[EvaluationSet] = (),
+    tracker: str | GeneralTracker | None = "tensorboard",
+) -> dict[str, list[dict[str, Any]]]:
+    """Trains `matcher` on the stream and returns its last scores on each pair of each of `sets`.
 
     Every rank reads its own share of the stream, in step with the others. A run that is resumed sees exactly the batches that the unbroken
-    run would have seen.
+    run would have seen. A step whose loss or gradient is not finite, or explodes, is skipped; see `trainers.step_guard`.
 
     Args:
         loss_function: (initial prediction, sequence of predictions, batch) -> (loss, metrics).
-        output: the run's folder: checkpoints, tracker logs, log.jsonl, evaluation.json.
+        output: the run's folder: checkpoints, best, tracker logs, log.jsonl, skipped.jsonl, evaluations.jsonl, evaluation.json.
         model_config: {"model": name, "options": {...}}, saved with the weights.
         arguments: what the run was started with, saved with its state.
         resume: a run's folder or one of its checkpoints.
-        pairs: stereo pairs with ground truth for the final evaluation.
-        tracker: any of Accelerate's, or None.
+        sets: what to judge by at the end and every `config.evaluate_every` steps. Each time a checkpoint is saved, too, and copied to
+            OUTPUT/best when it is the best so far, see `trainers.validation.Validation.is_best`.
+        tracker: any of Accelerate's by name, one of your own, or None.
+    Raises:
+        ValueError, ImportError, OSError: options, a tracker or a checkpoint that cannot be used.
+        TrainingDiverged: too many steps in a row had to be skipped.
     """
-    accelerator = Accelerator(
-        cpu=not torch.accelerator.is_available(),  # without it, ranks that torchrun starts on a CPU do not find each other
-        mixed_precision=config.mixed_precision,
-        gradient_accumulation_steps=config.accumulate,
-        log_with=tracker,
-        project_dir=str(output),
-    )
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "`log_with=")  # said as an error below
+        accelerator = Accelerator(
+            cpu=not torch.accelerator.is_available(),  # without it, ranks that torchrun starts on a CPU do not find each other
+            mixed_precision=config.mixed_precision,
+            gradient_accumulation_steps=config.accumulate,
+            log_with=tracker,
+            project_dir=str(output),
+        )
+    if tracker is not None and not accelerator.log_with:
+        raise ImportError(f"the tracker {tracker} is not installed: pip install {tracker}, or leave it out")
+    validation = Validation(sets, config.best_by)
+    if config.channels_last:
+        matcher.use_channels_last()
+    if config.compile:
+        matcher.compile_parts()
     optimizer = torch.optim.AdamW(matcher.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, eps=1e-8)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimizer,
@@ -105,67 +134,124 @@ def train(
         world_size=accelerator.num_processes,
     )
     output.mkdir(parents=True, exist_ok=True)
-    step = 0
+    step, training, state = 0, None, {}
     if resume is not None:
         checkpoint = run_folder.newest(resume)
-        load_checkpoint(matcher, checkpoint / "model.safetensors")
         training, state = run_folder.load(checkpoint)
+        planned = training["schedule"]["total_steps"] - SPARE_SCHEDULE_STEPS
+        if planned != config.steps:
+            raise ValueError(
+                f"{checkpoint} is of a run of {planned} steps, which its learning rate follows; resume it with --steps {planned}, "
+                f"or start a new run with --initial-weights {checkpoint / 'model.safetensors'}"
+            )
+        load_checkpoint(matcher, checkpoint / "model.safetensors")
+    average = None if config.ema is None else WeightAverage(matcher, config.ema)
+    if training is not None:
+        if training["weights"]:  # what was saved for use is the average
+            matcher.load_state_dict(training["weights"])
         optimizer.load_state_dict(training["optimizer"])
         schedule.load_state_dict(training["schedule"])
         loader.load_state_dict(state["stream"])
+        validation.load_state_dict(state["validation"])
         step = state["step"]
         accelerator.print(f"resumed from {checkpoint} at step {step}")
+        if validation.best is not None and accelerator.is_main_process:
+            run_folder.restore_best(checkpoint, output, validation.best["step"])
     model, optimizer = accelerator.prepare(matcher, optimizer)
-    if resume is not None and accelerator.scaler is not None and training["scaler"]:
-        accelerator.scaler.load_state_dict(training["scaler"])
+    model.train()
+    guard = StepGuard(accelerator, matcher, output / "skipped.jsonl")
+    if training is not None:
+        guard.load_state_dict(state["guard"])
+        if accelerator.scaler is not None and training["scaler"]:
+            accelerator.scaler.load_state_dict(training["scaler"])
+    if average is not None:
+        average.to(accelerator.device)
     if tracker is not None:
         accelerator.init_trackers(output.name or "run", {name: value for name, value in asdict(config).items() if value is not None})
 
-    def save() -> None:
+    def save(best: bool = False) -> None:
         if accelerator.is_main_process:
-            run_folder.save(
-                output,
-                step,
-                matcher,
-                model_config,
-                {
-                    "optimizer": optimizer.state_dict(),
-                    "schedule": schedule.state_dict(),
-                    "scaler": accelerator.scaler.state_dict() if accelerator.scaler is not None else {},
-                },
-                {"stream": loader.state_dict(), "world_size": accelerator.num_processes, "arguments": arguments},
-            )
+            with weights_of(average, matcher) as weights:
+                saved = run_folder.save(
+                    output,
+                    step,
+                    matcher,
+                    model_config,
+                    {
+                        "weights": weights,
+                        "optimizer": optimizer.state_dict(),
+                        "schedule": schedule.state_dict(),
+                        "scaler": accelerator.scaler.state_dict() if accelerator.scaler is not None else {},
+                    },
+                    {
+                        "stream": loader.state_dict(),
+                        "validation": validation.state_dict(),
+                        "guard": guard.state_dict(),
+                        "world_size": accelerator.num_processes,
+                        "arguments": arguments,
+                        "provenance": provenance(stream, arguments),
+                    },
+                )
+            if best:
+                run_folder.keep_best(saved, output)
         accelerator.wait_for_everyone()
 
-    model.train()
+    def judge() -> dict[str, list[dict[str, Any]]]:
+        """Scores, written down; the checkpoint of this step is saved and, if it is the best so far, kept."""
+        with weights_of(average, matcher):
+            results = validation.judge(
+                lambda left, right: matcher.predict(left, right, iterations=config.evaluation_iterations),
+                device=accelerator.device,
+                rank=accelerator.process_index,
+                world_size=accelerator.num_processes,
+            )
+        best = validation.is_best(results, step)
+        save(best)
+        if accelerator.is_main_process:
+            _write_scores(output, step, results, validation)
+        means = {name: mean_scores(scores)["all"] for name, scores in results.items()}
+        values = {f"{name}/{metric}": value for name, mean in means.items() for metric, value in mean.items() if value is not None}
+        accelerator.log(values, step=step)
+        for name, scores in results.items():
+            accelerator.print(f"step {step}, {name}{', the best so far' if best else ''}:\n{table(scores)}")
+        return results
+
+    results: dict[str, list[dict[str, Any]]] = {}
     progress = tqdm(total=config.steps, initial=step, unit="step", disable=not accelerator.is_main_process, dynamic_ncols=True)
     mark = _Mark(step, loader.stats()["seconds"].get("wait", 0.0))
-    saved = step
+    saved_step, judged_step = step, None
     while step < config.steps:
         for batch in loader:
             with accelerator.accumulate(model):
                 with accelerator.autocast():
                     initial, sequence = model(batch.left, batch.right, iterations=config.iterations)
                 loss, metrics = loss_function(initial, sequence, batch)
-                if not math.isfinite(loss.item()):
-                    ids = [(meta["epoch"], meta["index"], meta["key"]) for meta in batch.meta]
-                    raise RuntimeError(
-                        f"the loss is {loss.item()} at step {step}; samples (epoch, index, key): {ids}. stream.replay shows them"
-                    )
+                guard.watch(loss, batch)
                 accelerator.backward(loss)
+                refused = False
                 if accelerator.sync_gradients:
-                    accelerator.clip_grad_norm_(model.parameters(), config.clip_norm)
+                    norm = accelerator.clip_grad_norm_(model.parameters(), config.clip_norm)
+                    refused = guard.refuses(step, cast(Tensor, norm))
+                    if refused:
+                        optimizer.zero_grad()  # a step without gradients changes nothing
                 optimizer.step()
                 optimizer.zero_grad()
             if not accelerator.sync_gradients:
                 continue
             schedule.step()
             step += 1
+            if average is not None and not refused:
+                average.update(matcher, step)
             progress.update()
             if step % LOG_EVERY_STEPS == 0 or step == config.steps:
+                if step % RECONSTRUCT_EVERY_STEPS == 0:
+                    metrics |= _reconstruction(batch)
+                names, numbers = list(metrics), torch.stack([torch.as_tensor(value).float() for value in metrics.values()])
                 values = {
-                    "loss": loss.item(),
-                    **{name: float(value) for name, value in metrics.items()},
+                    "loss": guard.loss,
+                    **dict(zip(names, mean_over_ranks(numbers).tolist(), strict=True)),
+                    "gradient_norm": guard.gradient_norm,
+                    "skipped_steps": guard.skipped,
                     "learning_rate": schedule.get_last_lr()[0],
                 }
                 pairs_seen = (step - mark.step) * config.batch_size * config.accumulate * accelerator.num_processes
@@ -177,30 +263,45 @@ def train(
                     f"waiting {values['wait_share']:.0%}"
                 )
                 if accelerator.is_main_process:
-                    with (output / "log.jsonl").open("a") as log:
-                        place = loader.state_dict()
-                        log.write(json.dumps({"step": step, "epoch": place["epoch"], "samples": place["samples"], **values}) + "\n")
+                    place = loader.state_dict()
+                    _append(output / "log.jsonl", {"step": step, "epoch": place["epoch"], "samples": place["samples"], **values})
                 accelerator.log(values, step=step)
-            if step % config.save_every == 0:
+            if validation.sets and config.evaluate_every is not None and step % config.evaluate_every == 0:
+                results = judge()
+                saved_step = judged_step = step
+            elif step % config.save_every == 0:
                 save()
-                saved = step
+                saved_step = step
             if step == config.steps:
                 break
     progress.close()
-    if saved != step:
+    if validation.sets and judged_step != step:
+        results = judge()
+    elif saved_step != step:
         save()
-
-    scores: list[dict[str, Any]] = []
-    if pairs and accelerator.is_main_process:
-        scores = evaluate(
-            lambda left, right: matcher.predict(left, right, iterations=config.evaluation_iterations), pairs, device=accelerator.device
-        )
-        (output / "evaluation.json").write_text(json.dumps({"mean": mean_scores(scores), "pairs": scores}, indent=2) + "\n")
-        accelerator.print(table(scores))
-    accelerator.wait_for_everyone()
     loader.close()
     accelerator.end_training()
-    return scores
+    return results
+
+
+def _reconstruction(batch: StereoBatch) -> dict[str, Tensor]:
+    """How well the pairs and their labels fit together, as in the paper's table: every pixel counts."""
+    errors = reconstruction_error(batch.left_clean, batch.right_clean, batch.disparity)
+    return {f"reconstruction_{name}": error.mean() for name, error in errors._asdict().items()}
+
+
+def _write_scores(output: Path, step: int, results: dict[str, list[dict[str, Any]]], validation: Validation) -> None:
+    sets = {name: {"mean": mean_scores(scores), "pairs": scores} for name, scores in results.items()}
+    (output / "evaluation.json").write_text(json.dumps({"step": step, "best": validation.best, "sets": sets}, indent=2) + "\n")
+    means = {name: one["mean"] for name, one in sets.items()}
+    _append(output / "evaluations.jsonl", {"step": step, validation.best_by: validation.value(results), "means": means})
+
+
+def _append(path: Path, values: dict[str, Any]) -> None:
+    """One more line of JSON; what is not finite, which JSON does not know, is null."""
+    finite = {name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in values.items()}
+    with path.open("a") as file:
+        file.write(json.dumps(finite) + "\n")
 
 
 class _Mark:

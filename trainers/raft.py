@@ -7,21 +7,13 @@ accelerate launch trainers/raft.py --sources photos.tar --output runs/first --re
 from __future__ import annotations
 
 import argparse
-from typing import Any
 
 import torch
-from torch import Tensor
 
 from trainers.arguments import add_training_arguments, run, train_as_told
 from trainers.models import load_matcher
-from zsdata import StereoBatch, zero_stereo_loss
-
-
-def sequence_loss(initial: Tensor | None, sequence: list[Tensor], batch: StereoBatch) -> tuple[Tensor, dict[str, Any]]:
-    """The ZeroStereo loss over RAFT-Stereo's sequence of predictions."""
-    return zero_stereo_loss(
-        sequence, batch.left_clean, batch.right_clean, batch.disparity, batch.confidence, batch.masks, initial_prediction=initial
-    )
+from trainers.models.extractor import NORMS
+from trainers.training_loss import TrainingLoss
 
 
 def main() -> None:
@@ -35,6 +27,7 @@ def main() -> None:
     model.add_argument("--corr-levels", type=int, default=4, help="levels of the correlation pyramid (default: 4)")
     model.add_argument("--corr-radius", type=int, default=4, help="of the lookup (default: 4)")
     model.add_argument("--n-downsample", type=int, default=2, choices=(2, 3), help="features have 1/2^n of the resolution (default: 2)")
+    model.add_argument("--context-norm", choices=NORMS, default="batch", help="in the context encoder (default: batch)")
     model.add_argument("--n-gru-layers", type=int, default=3, choices=(1, 2, 3), help="default: 3")
     model.add_argument("--slow-fast-gru", action="store_true", help="update coarse GRUs more often")
     model.add_argument("--shared-backbone", action="store_true", help="one encoder for features and context")
@@ -46,6 +39,7 @@ def main() -> None:
         "corr_levels",
         "corr_radius",
         "n_downsample",
+        "context_norm",
         "n_gru_layers",
         "slow_fast_gru",
         "shared_backbone",
@@ -53,7 +47,8 @@ def main() -> None:
     options = {name: getattr(arguments, name) for name in names}
     torch.manual_seed(arguments.seed)  # the fresh weights
     matcher = load_matcher("raft_stereo", **options)
-    train_as_told(arguments, matcher, sequence_loss, "raft_stereo", options)
+    loss = TrainingLoss(name=arguments.loss, trusted=arguments.no_confidence)
+    train_as_told(arguments, matcher, loss, "raft_stereo", options)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,7 @@
-"""All the ranks that were asked for: on the CPU, `accelerate launch --num_processes N` starts a single process, unless told to use MPI."""
+"""Several ranks: all that were asked for, and what they have in common.
+
+On the CPU `accelerate launch --num_processes N` starts a single process, unless told to use MPI.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +9,10 @@ import os
 import sys
 
 import psutil
+import torch.distributed as distributed
 from accelerate.commands.config.config_args import default_config_file, load_config_from_file
 from accelerate.commands.launch import launch_command_parser
+from torch import Tensor
 
 RANKED_BY = ("WORLD_SIZE", "PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE")  # torchrun, Intel MPI, Open MPI, MVAPICH
 
@@ -48,3 +53,12 @@ def _processes_asked_for() -> int | None:
             if launched.config_file is not None or os.path.isfile(default_config_file):
                 return getattr(load_config_from_file(launched.config_file), "num_processes", None)
     return None
+
+
+def mean_over_ranks(values: Tensor) -> Tensor:
+    """The mean of `values` over all ranks, the same on each; `values` themselves where there is only one."""
+    if not (distributed.is_available() and distributed.is_initialized()):
+        return values
+    total = values.clone()
+    distributed.all_reduce(total)
+    return total / distributed.get_world_size()

@@ -4,6 +4,7 @@ OUTPUT/checkpoints/step-00000500/model.safetensors    weights under their publis
                                  config.json          which matcher with which options: what `evaluate.py` needs
                                  training.pt          optimizer, schedule and gradient scaler (tensors and numbers only)
                                  state.json           step, place in the stream, the run's arguments
+OUTPUT/best/                                          the checkpoint that was judged best, of the same files
 """
 
 from __future__ import annotations
@@ -50,6 +51,34 @@ def write(output: Path, step: int, weights: Callable[[Path], None], training: di
     for old in _whole(output)[:-KEPT_CHECKPOINTS]:
         shutil.rmtree(old)
     return folder
+
+
+def keep_best(checkpoint: Path, output: Path) -> Path:
+    """Copies a checkpoint to OUTPUT/best, in the place of an earlier best, as a whole."""
+    best = output / "best"
+    unfinished = output / f".best.{os.getpid()}"
+    try:
+        shutil.copytree(checkpoint, unfinished)
+        if best.exists():
+            shutil.rmtree(best)
+        os.replace(unfinished, best)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+    return best
+
+
+def restore_best(checkpoint: Path, output: Path, step: int) -> bool:
+    """Makes OUTPUT/best the checkpoint of `step`, which was the best when `checkpoint` was saved.
+
+    The run may have stopped before it was copied, or be resumed into another folder. False where that checkpoint is no longer there.
+    """
+    best = output / "best"
+    for folder in (best, checkpoint, checkpoint.parent.parent / "best"):
+        if (folder / "state.json").is_file() and json.loads((folder / "state.json").read_text())["step"] == step:
+            if folder != best:
+                keep_best(folder, output)
+            return True
+    return False
 
 
 def newest(path: Path) -> Path:

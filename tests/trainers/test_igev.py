@@ -13,6 +13,7 @@ from tests.scenes import grey_fill, layered_depth, photo_tar
 from trainers import run_folder
 from trainers.models import load_trained
 from trainers.models.mobilenet import TIMM_STAGES, MobileNetV2
+from trainers.training_loss import TrainingLoss
 from zsdata import Masks, StereoBatch, ZeroStereoStream
 
 SMALL = "--hidden-dims 16 16 16 --corr-radius 2 --max-disp 32 --n-gru-layers 2 --slow-fast-gru".split()
@@ -81,7 +82,7 @@ def test_labels_beyond_the_limit_supervise_neither_the_initial_nor_the_updated_p
         meta=[{}],
     )
     initial, update = (torch.zeros_like(label, requires_grad=True) for _ in range(2))
-    loss, _ = igev.sequence_loss(initial, [update], batch, max_disparity)
+    loss, _ = TrainingLoss(max_disparity=max_disparity)(initial, [update], batch)
     loss.backward()
     for prediction in (initial, update):
         assert (prediction.grad != 0).float().mean() == supervised

@@ -167,8 +167,9 @@ def test_the_backbone_loads_timms_imagenet_weights(tmp_path):
 def test_weights_of_another_backbone_are_refused_and_change_nothing(tmp_path):
     backbone = MobileNetV2()
     before = {name: tensor.clone() for name, tensor in backbone.state_dict().items()}
-    save_file({"conv_stem.weight": torch.zeros(32, 3, 3, 3)}, tmp_path / "other.safetensors")
-    with pytest.raises(ValueError, match=r"other.safetensors is no mobilenetv2_100 of timm: it lacks bn1.weight \[32\]"):
+    save_file({"conv_stem.weight": torch.zeros(32, 3, 3, 3), "layer1.0.weight": torch.zeros(1)}, tmp_path / "other.safetensors")
+    message = r"other.safetensors is no mobilenetv2_100 of timm \(missing: bn1.weight \[32\], .* and \d+ more; left over: layer1.0.weight\)"
+    with pytest.raises(ValueError, match=message):
         load_imagenet_weights(backbone, tmp_path / "other.safetensors")
     assert all(torch.equal(tensor, before[name]) for name, tensor in backbone.state_dict().items())
 

@@ -43,7 +43,7 @@ def load_checkpoint(matcher: nn.Module, path: str | PathLike[str]) -> None:
     ]
     if missing or left_over or shapes:
         lists = (("missing", missing), ("left over", left_over), ("of another shape", shapes))
-        found = "; ".join(f"{len(names)} {kind}: {_some(names)}" for kind, names in lists if names)
+        found = "; ".join(f"{len(names)} {kind}: {some(names)}" for kind, names in lists if names)
         raise ValueError(
             f"{path} does not fit {type(matcher).__name__} with these options ({found}); "
             "build the matcher with the options it was trained with"
@@ -82,6 +82,7 @@ def _names_of_one_tensor(state: dict[str, Tensor]) -> list[list[str]]:
     return [group for group in names.values() if len(group) > 1]
 
 
-def _some(names: list[str], at_most: int = 8) -> str:
+def some(names: list[str], at_most: int = 8) -> str:
+    """The first of the names, and how many more there are."""
     rest = len(names) - at_most
     return ", ".join(names[:at_most]) + (f" and {rest} more" if rest > 0 else "")

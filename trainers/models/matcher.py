@@ -78,7 +78,8 @@ class Matcher(nn.Module):
         self.eval()
         try:
             with torch.compiler.set_stance("force_eager"):
-                _, sequence = self(*padded, iterations=iterations, every_iteration=False)
+                # Of the class: Accelerate puts mixed precision around the forward of an instance, and a score is not to depend on it.
+                _, sequence = type(self).forward(self, *padded, iterations=iterations, every_iteration=False)
         finally:
             self.train(was_training)
         return sequence[-1][..., above : above + height, before : before + width].float()

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from trainers.models.checkpoint import read_weights
+from trainers.models.checkpoint import read_weights, some
 
 STEM_CHANNELS = 32
 # Channels at 1/2, 1/4, 1/8, 1/16 and 1/32.
@@ -19,6 +19,7 @@ CHANNELS = (16, 24, 32, 96, 160)
 EXPANSION = 6
 # Where timm's stages 0 to 5 went.
 TIMM_STAGES = ("block0.0", "block1.0", "block2.0", "block3.0", "block3.1", "block4.0")
+TIMM_LEFT_OUT = ("blocks.6.", "conv_head.", "bn2.", "classifier.")  # the last stage, the head, and its norm
 
 
 class DepthwiseSeparable(nn.Module):
@@ -91,21 +92,28 @@ def load_imagenet_weights(backbone: MobileNetV2, path: str | PathLike[str]) -> N
         path: timm's .safetensors or .pth file; its last stage and classifier are left out.
     Raises:
         FileNotFoundError: no such file.
-        ValueError: a file of another kind or of another network.
+        ValueError: a file of another kind or of another network; says what is missing and what is left over.
     """
-    weights = read_weights(Path(path))
+    weights = {name: tensor for name, tensor in read_weights(Path(path)).items() if not name.startswith(TIMM_LEFT_OUT)}
     own = backbone.state_dict()
-    for name in MobileNetV2().state_dict():
-        published = name
-        for i, prefix in enumerate(TIMM_STAGES):
-            if name.startswith(f"{prefix}."):
-                published = f"blocks.{i}" + name.removeprefix(prefix)
-        if name.endswith("num_batches_tracked"):
-            continue
-        if published not in weights or weights[published].shape != own[name].shape:
-            raise ValueError(f"{path} is no mobilenetv2_100 of timm: it lacks {published} {list(own[name].shape)}")
-        own[name] = weights[published]
-    backbone.load_state_dict(own)
+    names = {_timm_name(name): name for name in MobileNetV2().state_dict()}
+    missing = [
+        f"{timm} {list(own[name].shape)}"
+        for timm, name in names.items()
+        if not name.endswith("num_batches_tracked") and (timm not in weights or weights[timm].shape != own[name].shape)
+    ]
+    left_over = [name for name in weights if name not in names]
+    if missing or left_over:
+        lists = f"missing: {some(missing) or 'nothing'}; left over: {some(left_over) or 'nothing'}"
+        raise ValueError(f"{path} is no mobilenetv2_100 of timm ({lists})")
+    backbone.load_state_dict(own | {names[timm]: tensor for timm, tensor in weights.items()})
+
+
+def _timm_name(name: str) -> str:
+    for i, prefix in enumerate(TIMM_STAGES):
+        if name.startswith(f"{prefix}."):
+            return f"blocks.{i}" + name.removeprefix(prefix)
+    return name
 
 
 def stage(inputs: int, outputs: int, blocks: int, stride: int) -> nn.Sequential:

@@ -1,0 +1,107 @@
+"""What a matcher is judged by while it trains, and which of its checkpoints was best."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import torch
+from accelerate.utils import gather_object
+
+from trainers.benchmarks_on_disk import BENCHMARKS
+from trainers.evaluate import evaluate, open_dataset
+from trainers.pairs_on_disk import StereoPair
+from trainers.scores import METRICS, mean_scores
+from trainers.strips import Predict
+
+BEST_BY = "bad_2"  # Middlebury's measure; does not hang on the few pixels that are far off, as EPE does
+
+
+@dataclass(frozen=True)
+class EvaluationSet:
+    """One data set to judge by, as `trainers.evaluate.open_dataset` opens it."""
+
+    name: str
+    dataset: str
+    root: Path | None = None
+    variant: str | None = None
+
+    @staticmethod
+    def parse(spec: str) -> EvaluationSet:
+        """ "motorcycle", "kitti2015=ROOT", "middlebury:F=ROOT", "folder=ROOT", or a folder of pairs by its path alone.
+
+        Raises:
+            ValueError, FileNotFoundError: it cannot be opened; says what was expected where.
+        """
+        name, _, root = spec.partition("=")
+        dataset, _, variant = name.partition(":")
+        if dataset in ("motorcycle", *BENCHMARKS):
+            if (dataset == "motorcycle") == bool(root):
+                raise ValueError(
+                    f"{spec}: the motorcycle comes with scikit-image and has no folder" if root else f"say where it lies: {name}=DIR"
+                )
+            parsed = EvaluationSet(name, dataset, Path(root) if root else None, variant or None)
+        else:
+            folder = Path(root if name == "folder" else spec)
+            parsed = EvaluationSet(folder.resolve().name, "folder", folder)
+        parsed.pairs()
+        return parsed
+
+    def pairs(self) -> tuple[Iterator[StereoPair], int]:
+        """The pairs, read one by one, and how many there are."""
+        return open_dataset(self.dataset, self.root, self.variant)
+
+
+class Validation:
+    """Judges on several sets, shared out over the ranks, and remembers the best."""
+
+    def __init__(self, sets: Sequence[EvaluationSet], best_by: str = BEST_BY) -> None:
+        if best_by not in METRICS:
+            raise ValueError(f"best_by is one of {', '.join(METRICS)}; got {best_by!r}")
+        names = [one.name for one in sets]
+        if len(set(names)) < len(names):
+            raise ValueError(f"two evaluation sets have one name: {', '.join(names)}; put the pairs of both below one folder")
+        self.sets = list(sets)
+        self.best_by = best_by
+        self.best: dict[str, Any] | None = None  # {"step", "value"}
+
+    def judge(self, predict: Predict, *, device: torch.device, rank: int, world_size: int) -> dict[str, list[dict[str, Any]]]:
+        """The scores of every pair of every set, as `trainers.evaluate.evaluate` returns them, the same on all ranks."""
+        results = {}
+        for one in self.sets:
+            pairs, total = one.pairs()
+            below = BENCHMARKS[one.dataset].below_px if one.dataset in BENCHMARKS else ()
+            places = range(rank, total, world_size)
+            scores = evaluate(predict, islice(pairs, rank, None, world_size), device=device, total=len(places), below_px=below)
+            together = gather_object(list(zip(places, scores, strict=True)))
+            results[one.name] = [score for _, score in sorted(together, key=lambda entry: entry[0])]
+        return results
+
+    def is_best(self, results: dict[str, list[dict[str, Any]]], step: int) -> bool:
+        """Whether these results are the best so far, which is then remembered. Without sets nothing is.
+
+        What counts is `best_by` over all pixels with ground truth, averaged over the pairs of a set and then over the sets; less is better.
+        """
+        value = self.value(results)
+        if value is None or (self.best is not None and value >= self.best["value"]):
+            return False
+        self.best = {"step": step, "value": value, "by": self.best_by}
+        return True
+
+    def value(self, results: dict[str, list[dict[str, Any]]]) -> float | None:
+        """What the best is told by; None without a pixel to judge."""
+        means = [mean_scores(scores)["all"][self.best_by] for scores in results.values()]
+        known = [mean for mean in means if mean is not None]
+        return math.fsum(known) / len(known) if known else None
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"best": self.best}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on with the best of an earlier run, unless that was told by another measure."""
+        best = state["best"]
+        self.best = best if best is not None and best["by"] == self.best_by else None
