@@ -319,6 +319,13 @@ def test_missing_weights_are_named(copy):
         load_depth(copy)
 
 
+def test_weights_saved_in_half_precision_are_computed_with_in_float32(copy):
+    transformers.AutoModelForDepthEstimation.from_pretrained(copy).half().save_pretrained(copy)
+    images = photos(1)
+    made = load_depth(copy)(images)
+    assert made.dtype == torch.float32 and torch.isfinite(made).all() and made.std() > 0
+
+
 def test_weights_that_nothing_uses_may_be_missing(copy):
     """Published MiDaS networks lack the first fusion stage's first residual unit."""
     expected, path = load_depth(copy)(photos(1)), copy / "model.safetensors"

@@ -59,7 +59,7 @@ class PretrainedDepth:
         if missing:
             raise ValueError(f'depth="{name}" lacks {len(missing)} weights, "{missing[0]}" for one; download it again')
         self._predicts_depth = (network.predicts or _predicts(name, loaded.config)) == "depth"
-        self._network: Any = loaded.to(self.device).eval().requires_grad_(False)
+        self._network: Any = loaded.to(self.device, torch.float32).eval().requires_grad_(False)  # saved in half precision or not
         if self.device.type == "cuda":
             self._network.to(memory_format=torch.channels_last)
         if self.dtype != torch.float32:
