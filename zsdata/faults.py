@@ -57,9 +57,8 @@ class FailureBudget:
     """How many photos may be refused before the run stops: more than `count` of them, over all workers and ranks, and more than `rate` of
     all that were tried.
 
-    Only the last RECENT_PHOTOS that a rank has tried count, so that a bucket which breaks after a good week is noticed as soon as one that
-    is broken from the start. Ranks do not ask each other: every rank may refuse its share of `count`. Samples are dealt out at random, so
-    faults fall on all ranks alike.
+    Only the last RECENT_PHOTOS that a rank has tried count, so that a bucket which breaks after a good week is noticed in minutes. Ranks
+    do not ask each other: every rank may refuse its share of `count`. Samples are dealt out at random, so faults fall on all ranks alike.
     """
 
     count: int = 100

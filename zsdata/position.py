@@ -38,8 +38,8 @@ class Position:
             unknown = reprlib.repr(sorted(map(str, state.keys() - names)))
             raise ValueError(f"not a stream's state: missing {sorted(names - state.keys())}, unknown {unknown}")
         if type(state["version"]) is not int or state["version"] != VERSION:
-            raise ValueError(f"the state's version is {state['version']!r}; this zsdata reads version {VERSION}")
-        for name in ("seed", "epoch", "samples"):
+            raise ValueError(f"the state's version is {reprlib.repr(state['version'])}; this zsdata reads version {VERSION}")
+        for name in ("epoch", "samples"):
             if type(state[name]) is not int or not 0 <= state[name] < 2**63:
                 raise ValueError(f"the state's {name} must be an integer in 0..2^63 - 1; got {reprlib.repr(state[name])}")
         causes = {
@@ -48,7 +48,7 @@ class Position:
             "configuration": "an option of the stream differs (size, depth, inpaint, disparity, view, augmentation, ...)",
         }
         for name, cause in causes.items():
-            if state[name] != getattr(expected, name):
+            if type(state[name]) is not type(getattr(expected, name)) or state[name] != getattr(expected, name):
                 raise ValueError(
                     f"the state's {name} is {reprlib.repr(state[name])}, this stream's is {getattr(expected, name)!r}: {cause}. "
                     "Open the stream as it was when the state was saved, or start anew without it."

@@ -1,0 +1,72 @@
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from zsdata.position import Position
+
+HERE = Position(seed=7, epoch=3, samples=40, manifest="a" * 64, configuration="b" * 64)
+STATE = HERE.to_state()
+
+places = st.builds(
+    Position,
+    seed=st.integers(0, 2**63 - 1),
+    epoch=st.integers(0, 2**63 - 1),
+    samples=st.integers(0, 2**63 - 1),
+    manifest=st.text(min_size=1),
+    configuration=st.text(min_size=1),
+)
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=10,
+)
+
+
+@given(places)
+def test_a_state_comes_back_through_json(place):
+    assert Position.from_state(json.loads(json.dumps(place.to_state())), place) == place
+
+
+@given(json_values)
+def test_anything_else_is_refused_as_a_state(value):
+    with pytest.raises(ValueError, match="state"):
+        Position.from_state(value, HERE)
+
+
+@given(st.sampled_from(sorted(STATE)), json_values)
+def test_an_edited_field_is_refused_by_name_or_is_a_place(name, value):
+    state = {**STATE, name: value}
+    if name in ("epoch", "samples") and type(value) is int and 0 <= value < 2**63:
+        assert getattr(Position.from_state(state, HERE), name) == value
+    elif type(value) is type(STATE[name]) and value == STATE[name]:
+        assert Position.from_state(state, HERE) == HERE
+    else:
+        with pytest.raises(ValueError, match=f"the state's {name} "):
+            Position.from_state(state, HERE)
+
+
+@given(st.sampled_from(sorted(STATE)), st.text(min_size=1).filter(lambda name: name not in STATE))
+def test_missing_and_unknown_fields_are_named(missing, unknown):
+    with pytest.raises(ValueError, match=rf"missing \['{missing}'\]"):
+        Position.from_state({name: value for name, value in STATE.items() if name != missing}, HERE)
+    with pytest.raises(ValueError, match="unknown"):
+        Position.from_state({**STATE, unknown: 1}, HERE)
+
+
+def test_a_refusal_is_short_whatever_the_state_holds():
+    for state in (
+        {**STATE, "seed": "x" * 10**6},
+        {**STATE, "manifest": "x" * 10**6},
+        {**STATE, "y" * 10**6: 1},
+        {**STATE, "epoch": 10**3000},
+    ):
+        with pytest.raises(ValueError) as error:
+            Position.from_state(state, HERE)
+        assert len(str(error.value)) < 500
+
+
+def test_the_largest_state_is_small():
+    place = Position(seed=2**63 - 1, epoch=2**63 - 1, samples=2**63 - 1, manifest="f" * 64, configuration="f" * 64)
+    assert len(json.dumps(place.to_state())) < 400
