@@ -184,7 +184,7 @@ def test_a_shard_that_changed_is_named():
 def test_a_shard_is_looked_at_again_after_a_while(monkeypatch):
     with ShardFile(URL) as file:
         assert read(stamp=file.stamp) == read(stamp=file.stamp) == DATA[1000:101_000]
-        assert len(Faulty.looks) == 1
+        assert len(Faulty.looks) == 1  # by the one that opened it
         Faulty().pipe(URL, bytes(len(DATA)))
         monkeypatch.setattr(fsspec_ranges, "RECHECK_SECONDS", 0.0)
         with pytest.raises(ChangedShard):

@@ -1,5 +1,6 @@
 """The manifest: every photo, where it lies, and a digest that travels."""
 
+import os
 import pickle
 import tarfile
 
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 
 from zsdata.faults import BadShard
 from zsdata.source.archive import split_name
+from zsdata.source.index import write_index
 from zsdata.source.manifest import Manifest, build_manifest
 
 from .test_tar import FORMATS, members, write_tar
@@ -122,13 +124,22 @@ def test_what_cannot_be_taken_is_listed(tmp_path):
     ]
 
 
-def test_a_shard_that_shrank_is_damage(tmp_path):
+def test_a_shard_that_changed_is_damage(tmp_path):
     manifest = build_manifest(shards(tmp_path, *TWO))
+    os.utime(tmp_path / "s-1.tar", ns=(0, 7))
     with open(tmp_path / "s-0.tar", "r+b") as file:
         file.truncate(1600)
+    for index, says in ((0, "size 10,240 then, 1,600 now"), (2, r"modified_ns \d+ then, 7 now")):
+        with pytest.raises(BadShard, match=rf"s-\d.tar at byte .*: changed since it was listed: {says}"):
+            manifest.read(index)
+
+
+def test_a_shard_that_was_only_touched_is_read_where_an_index_knows_its_bytes(tmp_path):
+    urls = shards(tmp_path, *TWO)
+    write_index(urls)
+    manifest = build_manifest(urls)
+    os.utime(tmp_path / "s-0.tar", ns=(0, 7))
     assert manifest.read(0) == b"aa"
-    with pytest.raises(BadShard, match=r's-0.tar at byte 1,600: ends inside "é/b" \(64 of 600 bytes\)'):
-        manifest.read(1)
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,11 @@ STAMP_NAMES = ("ETag", "etag", "Content-MD5", "md5Hash", "Last-Modified", "LastM
 _looked: dict[str, tuple[float, Stamp]] = {}  # when, and what it was
 
 
+def look_anew(url: str) -> None:
+    """The next read looks at the shard, whenever it was looked at before."""
+    _looked.pop(url, None)
+
+
 def fetch_fsspec(url: str, offset: int, size: int, data: bytearray, check: Callable[[Stamp], None]) -> bool:
     """One try to read a range, see `retry.Fetch`.
 

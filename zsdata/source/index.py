@@ -13,31 +13,35 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fsspec.core import url_to_fs
 from tqdm import tqdm
 
 from zsdata.source.archive import MAX_PHOTO_BYTES, Problem, header_inside, photo_members
 from zsdata.source.ranges import ShardFile
-from zsdata.source.urls import base_name, expand_urls, local_path
+from zsdata.source.retry import Stamp
+from zsdata.source.urls import base_name, expand_urls, local_path, shown_url
 
 VERSION = 1
 MAX_INDEX_BYTES = 1 << 28  # 256 MiB; a photo takes about 50 bytes
 CHECKSUM_UNKNOWN = -1
 CHANGED_BYTES = "damaged: other bytes than when the shard was indexed"
 REMOTE_AT_ONCE = 16  # shards asked for their state at the same time
-_REMOTE_STAMPS = ("ETag", "etag", "Content-MD5", "md5Hash", "Last-Modified", "LastModified", "updated", "blob_id", "mtime", "created")
 
 
 @dataclass
 class Listing:
     """The photos of one shard in order; `problems` is what could not be taken."""
 
-    size: int  # bytes of the shard
+    stamp: Stamp  # of the shard, see `ShardFile`
     keys: list[str] = field(default_factory=list)
     offsets: array[int] = field(default_factory=lambda: array("q"))
     sizes: array[int] = field(default_factory=lambda: array("i"))
     checksums: array[int] = field(default_factory=lambda: array("q"))  # CRC-32 of the bytes, or CHECKSUM_UNKNOWN
     problems: list[Problem] = field(default_factory=list)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the shard."""
+        return int(self.stamp["size"])  # type: ignore[arg-type]
 
 
 @dataclass
@@ -55,14 +59,14 @@ class IndexReport:
 def list_shard(url: str, checksums: bool = False) -> Listing:
     """Walks the headers of a shard; with `checksums` it reads the photos too. Raises what opening it raises."""
     with ShardFile(url) as file:
-        listing = Listing(file.size)
+        listing = Listing(file.stamp)
         for key, offset, size in photo_members(file, listing.problems.append):
             checksum = CHECKSUM_UNKNOWN
             if checksums:
                 data = file.read_at(offset, size)
-                fault = header_inside(url, key, offset, data)
+                fault = header_inside(file.url, key, offset, data)
                 if fault is not None:
-                    listing.problems.append(Problem(url, key, fault.offset, fault.reason))
+                    listing.problems.append(Problem(file.url, key, fault.offset, fault.reason))
                     continue
                 checksum = zlib.crc32(data)
             listing.keys.append(key)
@@ -91,10 +95,10 @@ def write_index(urls: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
         except StaleIndex:
             listing, unchanged = None, False
         if listing is None:
-            stamp = _stamp(url)
             listing, unchanged = list_shard(url, checksums=True), False
+            stamp = dict(listing.stamp)
             if _stamp(url) != stamp:
-                raise OSError(f"{url} changed while it was indexed; run this again when nothing writes to it")
+                raise OSError(f"{shown_url(url)} changed while it was indexed; run this again when nothing writes to it")
             report.files.append(_store(url, _to_json(url, stamp, listing)))
         report.shards += 1
         report.unchanged += unchanged
@@ -132,6 +136,7 @@ def load_listing(url: str, *, even_if_touched: bool = False) -> Listing | None:
         now = _stamp(url)
         if now != stamp and not (even_if_touched and now["size"] == stamp["size"]):
             raise StaleIndex(f"{path} is older than its shard")
+        listing.stamp = now
         return listing
     return None
 
@@ -169,12 +174,8 @@ def _stamp(url: str) -> dict[str, Any]:
     if path is not None:
         state = os.stat(path)
         return {"size": state.st_size, "modified_ns": state.st_mtime_ns}
-    with ShardFile(url) as file:  # which also says what a url needs
-        size = file.size
-    file_system, remote_path = url_to_fs(url)
-    info = file_system.info(remote_path)
-    found = next((name for name in _REMOTE_STAMPS if info.get(name)), None)
-    return {"size": size} if found is None else {"size": size, found: str(info[found])}
+    with ShardFile(url) as file:
+        return dict(file.stamp)
 
 
 def _store(url: str, text: str) -> str:
@@ -227,7 +228,7 @@ def _from_json(url: str, text: bytes) -> tuple[dict[str, Any], Listing]:
     try:
         stamp, keys = content["stamp"], content["keys"]
         offsets, sizes, checksums = array("q", content["offsets"]), array("i", content["sizes"]), array("q", content["crc32"])
-        problems = [Problem(url, key, offset, reason) for key, offset, reason in content["problems"]]
+        problems = [Problem(shown_url(url), key, offset, reason) for key, offset, reason in content["problems"]]
         size = stamp["size"]
         in_order = (
             isinstance(size, int)
@@ -243,4 +244,4 @@ def _from_json(url: str, text: bytes) -> tuple[dict[str, Any], Listing]:
         raise ValueError("a field is missing or of another type") from error
     if not (in_order and in_range and told and (not offsets or offsets[0] >= 0)):
         raise ValueError("members overlap or lie outside of the shard")
-    return stamp, Listing(size, keys, offsets, sizes, checksums, problems)
+    return stamp, Listing(stamp, keys, offsets, sizes, checksums, problems)

@@ -20,14 +20,16 @@ from zsdata.faults import BadPhoto
 from zsdata.source.archive import Problem, header_inside
 from zsdata.source.index import CHANGED_BYTES, CHECKSUM_UNKNOWN, load_or_list
 from zsdata.source.ranges import ShardFile, read_range
+from zsdata.source.retry import Stamp
+from zsdata.source.shard_cache import ShardCache
 from zsdata.source.tar import walk_tar
-from zsdata.source.urls import base_name, expand_urls
+from zsdata.source.urls import base_name, expand_urls, local_path, shown_url
 
 logger = logging.getLogger("zsdata")
 
 
 class Member(NamedTuple):
-    """One photo: `size` bytes at `offset` of a shard."""
+    """One photo: `size` bytes at `offset` of a shard, whose url is as it may stand in messages."""
 
     shard_url: str
     key: str
@@ -52,6 +54,7 @@ class Manifest:
     key_ends: np.ndarray  # [N] int64, into key_text
     problems: tuple[Problem, ...]
     digest: str
+    stamps: tuple[Stamp, ...] | None = None  # what changes with each shard, see `ShardFile`
     checksums: np.ndarray | None = None  # [N] int64, CRC-32 of the bytes where an index knows it, else CHECKSUM_UNKNOWN
 
     def __len__(self) -> int:
@@ -64,20 +67,29 @@ class Manifest:
             raise IndexError(f"photo {index} of a source with {len(self):,}")
         start = int(self.key_ends[index - 1]) if index else 0
         key = self.key_text[start : int(self.key_ends[index])].decode("utf-8", "surrogateescape")
-        return Member(self.shard_urls[self.shard_numbers[index]], key, int(self.offsets[index]), int(self.sizes[index]))
+        return Member(shown_url(self.shard_urls[self.shard_numbers[index]]), key, int(self.offsets[index]), int(self.sizes[index]))
 
-    def read(self, index: int) -> bytes:
+    def read(self, index: int, cache: ShardCache | None = None) -> bytes:
         """The bytes of photo `index`, read by range.
 
+        Args:
+            cache: where those of a remote shard are looked for first, and kept.
+
         Raises:
-            BadShard: the shard no longer has all of them, or another member has moved into them.
+            BadShard: the shard no longer has all of them, another member has moved into them, or it is another shard now (ChangedShard).
             BadPhoto: they are not those that were indexed.
+            OSError: the shard cannot be read; UnreachableShard for a remote one.
         """
-        url, key, offset, size = self.member(index)
-        data = read_range(url, offset, size, inside=f'"{key}"')
+        shown, key, offset, size = self.member(index)
+        number = self.shard_numbers[index]
+        url = self.shard_urls[number]
         checksum = CHECKSUM_UNKNOWN if self.checksums is None else int(self.checksums[index])
+        stamp = None if self.stamps is None else self.stamps[number]
+        if checksum != CHECKSUM_UNKNOWN and local_path(url) is not None:
+            stamp = None  # a file may be touched; its bytes say more
+        data = read_range(url, offset, size, inside=f'"{key}"', stamp=stamp, cache=cache)
         if checksum == CHECKSUM_UNKNOWN:
-            fault = header_inside(url, key, offset, data)
+            fault = header_inside(shown, key, offset, data)
             if fault is not None:
                 raise fault
         elif zlib.crc32(data) != checksum:
@@ -98,6 +110,7 @@ def build_manifest(urls: str | os.PathLike[str] | Sequence[str | os.PathLike[str
     """
     shard_urls = expand_urls(urls)
     shard_sizes: list[int] = []
+    stamps: list[Stamp] = []
     shard_numbers, offsets, sizes, key_ends, checksums = array("i"), array("q"), array("i"), array("q"), array("q")
     key_text = bytearray()
     problems: list[Problem] = []
@@ -106,6 +119,7 @@ def build_manifest(urls: str | os.PathLike[str] | Sequence[str | os.PathLike[str
     listings = load_or_list(shard_urls, stale)
     for number, listing in enumerate(tqdm(listings, desc="indexing", unit="shard", total=len(shard_urls), disable=hidden)):
         shard_sizes.append(listing.size)
+        stamps.append(listing.stamp)
         problems += listing.problems
         shard_numbers.extend([number] * len(listing.keys))
         offsets.extend(listing.offsets)
@@ -129,6 +143,7 @@ def build_manifest(urls: str | os.PathLike[str] | Sequence[str | os.PathLike[str
         shard_urls=tuple(shard_urls),
         shard_sizes=tuple(shard_sizes),
         problems=tuple(problems),
+        stamps=tuple(stamps),
         checksums=np.array(checksums, np.int64),
         digest=_digest(shard_urls, shard_sizes, columns),
         **columns,
@@ -154,8 +169,9 @@ def _nothing_found(urls: Sequence[str], problems: Sequence[Problem]) -> str:
             "." + base.partition(".")[2] if "." in base else "files without a dot"
             for base in (member.name.rpartition("/")[2] for member in walk_tar(file, lambda fault: None) if member.kind == "file")
         )
+    first = shown_url(urls[0])
     found = ", ".join(f"{count:,} {extension}" for extension, count in extensions.most_common(5)) or "no files"
-    shards = urls[0] if len(urls) == 1 else f"{len(urls):,} shards (the first is {urls[0]})"
+    shards = first if len(urls) == 1 else f"{len(urls):,} shards (the first is {first})"
     message = f"no JPEG, PNG or WebP in {shards}: it holds {found}"
     if problems:
         message += "; " + "; ".join(f"{problem.key or base_name(problem.shard)}: {problem.reason}" for problem in problems[:3])

@@ -6,7 +6,7 @@ import os
 from types import TracebackType
 
 from zsdata.faults import BadShard
-from zsdata.source.fsspec_ranges import fetch_fsspec
+from zsdata.source.fsspec_ranges import fetch_fsspec, look_anew
 from zsdata.source.http_ranges import fetch_http
 from zsdata.source.retry import Stamp, check_unchanged, read_patiently
 from zsdata.source.shard_cache import ShardCache
@@ -23,6 +23,7 @@ class ShardFile:
     request. It belongs to the process that opened it.
 
     Attributes:
+        url: as it may stand in messages, see `shown_url`.
         size: bytes.
         stamp: what changes with the shard: {"size": bytes} with "modified_ns" of a local one, or with a remote one's tag or time where its
             server gives one ("ETag", "Last-Modified", ...). Plain JSON.
@@ -36,7 +37,8 @@ class ShardFile:
     stamp: Stamp
 
     def __init__(self, url: str) -> None:
-        self.url = url
+        self.url = shown_url(url)
+        self._url = url
         self._window, self._window_start = b"", 0
         self._descriptor = -1
         path = local_path(url)
@@ -45,6 +47,7 @@ class ShardFile:
             self._descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
             self.stamp = _local_stamp(self._descriptor)
         else:
+            look_anew(url)
             self._window, self.stamp = _read_remote(url, 0, FIRST_BYTES, None)
         size = self.stamp["size"]
         assert isinstance(size, int)
@@ -65,7 +68,7 @@ class ShardFile:
         first = offset - self._window_start
         if first < 0 or first + size > len(self._window):
             ahead = max(size, min(WINDOW_BYTES, self.size - offset))
-            self._window, self._window_start, first = _read_remote(self.url, offset, ahead, self.stamp)[0], offset, 0
+            self._window, self._window_start, first = _read_remote(self._url, offset, ahead, self.stamp)[0], offset, 0
         return self._window[first : first + size]
 
     def close(self) -> None:

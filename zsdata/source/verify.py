@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 
 from tqdm import tqdm
 
-from zsdata.faults import BadPhoto
+from zsdata.faults import BadPhoto, BadShard
 from zsdata.source.archive import Problem, photo_members
 from zsdata.source.index import CHANGED_BYTES, StaleIndex, load_listing
 from zsdata.source.photo import decode_rgb
 from zsdata.source.ranges import ShardFile
-from zsdata.source.urls import base_name, expand_urls
+from zsdata.source.urls import base_name, expand_urls, shown_url
 
 
 @dataclass
@@ -62,6 +62,7 @@ def verify(
         for number, url in enumerate(shard_urls, start=1):
             bar.set_postfix_str(f"shard {number} of {len(shard_urls)}: {base_name(url)}")
             before = report.photos + len(report.problems)
+            shown = shown_url(url)
             try:
                 with ShardFile(url) as file:
                     report.bytes += file.size
@@ -73,13 +74,15 @@ def verify(
                         if reason is None:
                             report.photos += 1
                         else:
-                            add(Problem(url, key, offset, reason))
+                            add(Problem(shown, key, offset, reason))
                         bar.update()
                     indexed.report_missing()
+            except BadShard as fault:  # it changed meanwhile
+                add(Problem(shown, None, fault.offset, fault.reason))
             except OSError as error:
-                add(Problem(url, None, 0, f"cannot be read: {error.strerror or error}"))
+                add(Problem(shown, None, 0, f"cannot be read: {error.strerror or error}"))
             if report.photos + len(report.problems) == before:
-                add(Problem(url, None, 0, "no JPEG, PNG or WebP in it"))
+                add(Problem(shown, None, 0, "no JPEG, PNG or WebP in it"))
             report.shards += 1
     return report
 
@@ -88,11 +91,11 @@ class _Indexed:
     """What the index of a shard knows of its photos; nothing without an index."""
 
     def __init__(self, url: str, add: Callable[[Problem], None]) -> None:
-        self._url, self._add = url, add
+        self._url, self._add = shown_url(url), add
         try:
             listing = load_listing(url, even_if_touched=True)  # a copy has another time and must have the same bytes
         except StaleIndex as stale:
-            add(Problem(url, None, 0, f"index not usable: {stale}; zsdata index renews it"))
+            add(Problem(self._url, None, 0, f"index not usable: {stale}; zsdata index renews it"))
             listing = None
         self.found = listing is not None
         self._checksums = {} if listing is None else dict(zip(listing.keys, listing.checksums, strict=True))
