@@ -18,9 +18,9 @@ from zsdata.meter import Meter
 from zsdata.prepared import Draft, Drafts, Prepared, make
 from zsdata.sample import Masks, StereoBatch
 from zsdata.seeding import rng
-from zsdata.synthesis.depth import DepthEstimator
+from zsdata.synthesis.depth import DepthEstimator, as_network
 from zsdata.synthesis.inpaint import Inpainter, fill
-from zsdata.synthesis.synthesizer import DepthMaps, estimate_depth
+from zsdata.synthesis.synthesizer import INPAINT_CONTEXT_PX, DepthMaps, estimate_depth, predict_depth
 from zsdata.worker import Recipe, naming, single_thread, store_depth
 
 
@@ -33,32 +33,39 @@ class Synthesis:
 
     def __call__(self, drafts: Drafts, device: torch.device, meter: Meter) -> Prepared:
         """The pairs of a batch of drafts, on the device; a photo's depth is estimated once, however many views of it are in the batch."""
-        pairs: list[Prepared] = []
-        known: dict[tuple[str, str], DepthMaps] = {}
+        with meter.stage("depth"):
+            known = self._estimate({_photo(draft): draft for draft in drafts.drafts if draft.depth is None}, device)
+        pairs = []
         for draft in drafts.drafts:
+            depth = draft.depth if draft.depth is not None else known[_photo(draft)]
+            depth = depth._replace(inverse_depth=depth.inverse_depth.to(device), confidence=depth.confidence.to(device))
             with naming(draft.meta):
-                pairs.append(self._make(draft, known, device, meter))
+                left = draft.left.to(device, non_blocking=True)
+                pairs.append(make(replace(draft, left=left), depth, self.recipe.inpainter_needs, self.recipe.synthesis, meter))
         made = Prepared.stack(pairs)
         meta = [{**made.meta[row], "index": sample["index"]} for row, sample in zip(drafts.rows, drafts.meta, strict=True)]
         return replace(made, meta=meta, rejected=drafts.rejected, seconds=drafts.seconds, rows=drafts.rows)
 
-    def _make(self, draft: Draft, known: dict[tuple[str, str], DepthMaps], device: torch.device, meter: Meter) -> Prepared:
-        photo = (draft.meta["shard"], draft.meta["key"])
-        depth = draft.depth if draft.depth is not None else known.get(photo)
-        if depth is None:
-            with meter.stage("depth"):
-                depth = known[photo] = self._estimate(draft, device)
-        depth = depth._replace(inverse_depth=depth.inverse_depth.to(device), confidence=depth.confidence.to(device))
-        left = draft.left.to(device, non_blocking=True)
-        return make(replace(draft, left=left), depth, self.recipe.inpainter_needs, self.recipe.synthesis, meter)
-
-    def _estimate(self, draft: Draft, device: torch.device) -> DepthMaps:
-        assert draft.photo is not None  # a draft has either
-        with torch.inference_mode():
-            depth = estimate_depth(self.depth, draft.photo.to(device, non_blocking=True).unsqueeze(0).float(), self.recipe.synthesis)
+    @torch.inference_mode()
+    def _estimate(self, drafts: dict[tuple[str, str], Draft], device: torch.device) -> dict[tuple[str, str], DepthMaps]:
+        """Depth of the photos of these drafts: by a network with two halves all in one go, otherwise one by one."""
+        config = self.recipe.synthesis
+        photos = [draft.photo.to(device, non_blocking=True) for draft in drafts.values() if draft.photo is not None]
+        if as_network(self.recipe.depth) is not None:
+            found = predict_depth(self.depth, photos, [tuple(draft.meta["photo_size"]) for draft in drafts.values()], config)
+        else:
+            found = []
+            for photo, draft in zip(photos, drafts.values(), strict=True):
+                with naming(draft.meta):
+                    found.append(estimate_depth(self.depth, photo.float(), config))
         if self.recipe.depth_cache is not None:
-            store_depth(self.recipe.depth_cache, draft.digest, depth)
-        return depth
+            for draft, depth in zip(drafts.values(), found, strict=True):
+                store_depth(self.recipe.depth_cache, draft.digest, depth)
+        return dict(zip(drafts, found, strict=True))
+
+
+def _photo(draft: Draft) -> tuple[str, str]:
+    return draft.meta["shard"], draft.meta["key"]
 
 
 @dataclass(frozen=True)
@@ -72,6 +79,14 @@ class Finisher:
     synthesis: Synthesis | None = None
     reuse: int = 1
     _last: dict[str, Any] = field(default_factory=dict)  # the pair that was filled last: its next sample may begin the next batch
+
+    def warm_up(self, size: tuple[int, int]) -> list[Any]:
+        """Makes the networks ready for crops of this (height, width), as training has memory and no time then; what each of them says."""
+        height, width = size
+        steps = [(self.inpainter, (height, width + INPAINT_CONTEXT_PX))]
+        if self.synthesis is not None:
+            steps.append((self.synthesis.depth, size))
+        return [step.warm_up(area) for step, area in steps if hasattr(step, "warm_up")]
 
     @torch.no_grad()
     def __call__(self, prepared: Prepared | Drafts, meter: Meter) -> StereoBatch:

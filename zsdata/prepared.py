@@ -59,7 +59,7 @@ class Draft:
     """A pair before its depth is known, or before it is used.
 
     Attributes:
-        photo: uint8 [3, H, W], the whole photo; None where its depth is known.
+        photo: uint8 [1, 3, h, w], the whole photo, or what the depth network's `prepare` made of it; None where its depth is known.
         depth: of at least the rows that the view shows; None where it is still to be estimated.
         digest: names the photo in the depth cache; "" without one.
         left: uint8 [3, height, width], the view, margin included.

@@ -9,7 +9,8 @@ import os
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, replace
-from typing import Any
+from importlib.metadata import version
+from typing import Any, Literal
 
 import torch
 from torch.utils.data import IterableDataset, get_worker_info
@@ -17,18 +18,19 @@ from torch.utils.data import IterableDataset, get_worker_info
 from zsdata.augment import AugmentConfig
 from zsdata.faults import FailureBudget, FaultLog
 from zsdata.finish import Finisher, Synthesis
+from zsdata.licences import model_records, require_commercial
 from zsdata.loader import SAMPLE_TIMEOUT_SECONDS, StereoLoader
 from zsdata.meter import Meter
 from zsdata.position import Position
 from zsdata.prepared import Draft, Prepared, stack
 from zsdata.sample import StereoBatch
 from zsdata.sources import Schedule
-from zsdata.synthesis.depth import DepthEstimator, load_depth
+from zsdata.synthesis.depth import DepthEstimator, DepthNetwork, as_network, load_depth
 from zsdata.synthesis.depth.builtin import warn_once
 from zsdata.synthesis.depth.cache import DepthCache
 from zsdata.synthesis.depth.identity import depth_identity
 from zsdata.synthesis.disparity import AdaptiveDisparity, UniformDisparity
-from zsdata.synthesis.inpaint import Inpainter, load_inpainter
+from zsdata.synthesis.inpaint import DiffusionNetwork, Inpainter, load_inpainter
 from zsdata.synthesis.synthesizer import SynthesisConfig
 from zsdata.synthesis.view import ViewConfig
 from zsdata.worker import Recipe, Worker
@@ -55,8 +57,9 @@ class ZeroStereoStream(IterableDataset):
             ({"indoor": ImageSource("in.tar", weight=0.7), "street": ImageSource("out.tar", weight=0.3)}), or any of these by the epoch
             from which they are used ({0: "first.tar", 5: "second.tar"}).
         size: (height, width) of the pairs, in pixels; None gives every pair its photo's own size: the whole photo as it is.
-        depth: "builtin", a Hub id or folder in the transformers format, or a callable (see `load_depth`).
-        inpaint: "builtin", "background", a Hub id or folder in the diffusers format, or a callable (see `load_inpainter`).
+        depth: "builtin", a Hub id or folder in the transformers format, a `DepthNetwork` with options, or a callable (see `load_depth`).
+        inpaint: "builtin", "background", a Hub id or folder in the diffusers format, a `DiffusionNetwork` with options, or a callable (see
+            `load_inpainter`).
         disparity: how far apart the cameras stand: AdaptiveDisparity (the paper's) or UniformDisparity (MfS-Stereo's).
         seed: an integer >= 0.
         epoch_size: samples per epoch; None is one exact pass over the photos, whatever their sources' weights.
@@ -67,6 +70,8 @@ class ZeroStereoStream(IterableDataset):
         depth_placement: "worker": depth is estimated by the loader's workers, on the CPU; "device": workers stop after decoding, and the
             loader estimates and warps on its device; "auto": on the device for a network whose loader has a GPU, in the workers otherwise.
             Plain iteration and `replay` do everything on the CPU.
+        depth_resolution: the short side of a depth network's input in pixels, or "native", the photo's own size; None is the network's own.
+        commercial_safe: refuses models that are known to be for non-commercial use alone.
         depth_cache: a folder that keeps the depth of every photo, so that a slow estimator is paid once per photo and not once per epoch.
             Any number of workers, ranks and runs may share it.
         depth_cache_bytes: the most that the folder may hold; 3 bytes per pixel of each photo. A full cache keeps what it has.
@@ -82,14 +87,16 @@ class ZeroStereoStream(IterableDataset):
         sources: Any,
         *,
         size: tuple[int, int] | None = (384, 512),
-        depth: str | os.PathLike[str] | DepthEstimator = "builtin",
-        inpaint: str | os.PathLike[str] | Inpainter = "builtin",
+        depth: str | os.PathLike[str] | DepthNetwork | DepthEstimator = "builtin",
+        inpaint: str | os.PathLike[str] | DiffusionNetwork | Inpainter = "builtin",
         disparity: AdaptiveDisparity | UniformDisparity | None = None,
         seed: int = 0,
         epoch_size: int | None = None,
         views_per_image: int = 1,
         reuse: int = 1,
         depth_placement: str = "auto",
+        depth_resolution: int | Literal["native"] | None = None,
+        commercial_safe: bool = False,
         depth_cache: str | os.PathLike[str] | None = None,
         depth_cache_bytes: int = DEPTH_CACHE_BYTES,
         view: ViewConfig | None = None,
@@ -114,11 +121,18 @@ class ZeroStereoStream(IterableDataset):
         self._revision = 0
         self._told_problems = 0
         self._tell_problems()
-        self._inpaint = inpaint if callable(inpaint) else os.fspath(inpaint)
+        self._inpaint = inpaint if callable(inpaint) or isinstance(inpaint, DiffusionNetwork) else os.fspath(inpaint)
         self._augmentation = augmentation if augmentation is not None else AugmentConfig()
         self._budget = budget if budget is not None else FailureBudget()
         inpainter = load_inpainter(self._inpaint) if callable(inpaint) or self._inpaint in ("builtin", "background") else None
-        depth = depth if callable(depth) else os.fspath(depth)
+        depth = depth if callable(depth) or isinstance(depth, DepthNetwork) else os.fspath(depth)
+        if depth_resolution is not None:
+            if not isinstance(depth, str) or depth == "builtin":
+                raise ValueError(f"depth_resolution belongs to a network given by name or folder; depth is {_name_of(depth)!r}")
+            depth = DepthNetwork(depth, resolution=depth_resolution)
+        if commercial_safe:
+            require_commercial(depth, "depth")
+            require_commercial(self._inpaint, "inpaint")
         synthesis = synthesis if synthesis is not None else SynthesisConfig()
         self._recipe = Recipe(
             seed=seed,
@@ -222,10 +236,14 @@ class ZeroStereoStream(IterableDataset):
         device = torch.device(device)
         on_device = self._depth_placement == "device"
         if self._depth_placement == "auto":
-            on_device = device.type != "cpu" and isinstance(self._recipe.depth, str) and self._recipe.depth != "builtin"
+            on_device = device.type != "cpu" and as_network(self._recipe.depth) is not None
+        finisher = self._finisher(device, micro_batch, on_device)
+        if device.type != "cpu" and self._recipe.size is not None:
+            for ready in finisher.warm_up(self._recipe.size):
+                logger.info("%s", ready)
         return StereoLoader(
             worker=Worker(replace(self._recipe, depth_on_device=True)) if on_device else self._worker,
-            finisher=self._finisher(device, micro_batch, on_device),
+            finisher=finisher,
             place=lambda: self._place(0, 0),
             revision=lambda: self._revision,
             epoch_size=self.epoch_size,
@@ -261,6 +279,22 @@ class ZeroStereoStream(IterableDataset):
             "examples": list(self._faults.examples),
             "shard_problems": dict(self._count_problems()),
             "seconds": dict(self._meter.seconds),
+        }
+
+    def provenance(self) -> dict[str, Any]:
+        """What the pairs are made with, to be kept with whatever is trained on them: plain JSON values.
+
+        The version, the seed, the digests of the photos and of the configuration, and of every model its id, revision and licence, as far
+        as they are known.
+        """
+        place = self._place(0, 0)
+        return {
+            "zsdata": version("zsdata"),
+            "seed": place.seed,
+            "manifest": place.manifest,
+            "configuration": place.configuration,
+            "depth": model_records(self._recipe.depth),
+            "inpaint": model_records(self._inpaint),
         }
 
     def _count_problems(self) -> Counter[str]:
@@ -314,7 +348,7 @@ class ZeroStereoStream(IterableDataset):
 
 
 def _open_cache(
-    folder: str | os.PathLike[str] | None, max_bytes: int, depth: str | DepthEstimator, synthesis: SynthesisConfig
+    folder: str | os.PathLike[str] | None, max_bytes: int, depth: str | DepthNetwork | DepthEstimator, synthesis: SynthesisConfig
 ) -> DepthCache | None:
     if folder is None:
         return None
@@ -322,5 +356,8 @@ def _open_cache(
     return DepthCache(folder, max_bytes, f"{depth_identity(depth)}, {confidence}")
 
 
-def _name_of(step: Any) -> str:
+def _name_of(step: Any) -> Any:
+    """What a step is called in the configuration's digest: what changes its pictures, and nothing else."""
+    if isinstance(step, DepthNetwork | DiffusionNetwork):
+        return {name: value for name, value in asdict(step).items() if name not in ("compile", "micro_batch", "memory_gib")}
     return step if isinstance(step, str) else f"{type(step).__module__}.{getattr(step, '__qualname__', type(step).__qualname__)}"

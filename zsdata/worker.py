@@ -20,8 +20,10 @@ from zsdata.prepared import Draft, Prepared, Rejected, make
 from zsdata.seeding import rng
 from zsdata.source.photo import decode_rgb, probe_size
 from zsdata.sources import Schedule, SourceSet
-from zsdata.synthesis.depth import DepthEstimator, load_depth
+from zsdata.synthesis.depth import DepthEstimator, DepthNetwork, as_network, load_depth
 from zsdata.synthesis.depth.cache import DepthCache, photo_digest
+from zsdata.synthesis.depth.preprocessing import Preprocessing
+from zsdata.synthesis.depth.pretrained import load_preprocessing
 from zsdata.synthesis.disparity import AdaptiveDisparity, UniformDisparity
 from zsdata.synthesis.synthesizer import INPAINT_CONTEXT_PX, DepthMaps, SynthesisConfig, estimate_depth
 from zsdata.synthesis.view import ViewConfig, draw_view, view_photo, whole_view
@@ -37,7 +39,7 @@ class Recipe:
     seed: int
     size: tuple[int, int] | None  # None: each photo whole, at its own size
     schedule: Schedule
-    depth: str | DepthEstimator
+    depth: str | DepthNetwork | DepthEstimator
     depth_cache: DepthCache | None
     disparity: AdaptiveDisparity | UniformDisparity
     view: ViewConfig
@@ -73,6 +75,7 @@ class Worker:
         self._recipe = recipe
         self._depth: DepthEstimator | None = None
         self._last: tuple[tuple[str, int], _Photo] | None = None  # the photo whose next view comes next
+        self._preprocessing: Preprocessing | None = None
         self._last_pair: tuple[tuple[SourceSet, int, int], Prepared | Draft] | None = None
 
     def prepare(self, epoch: int, index: int) -> Prepared | Draft:
@@ -158,11 +161,20 @@ class Worker:
             "disparity_scale": scale,
             "replaced": [list(reject) for reject in rejected],  # photos that could not be used: source, shard, key, reason
         }
-        pixels_for_depth = None
+        unseen = None
         if depth is None:
-            with meter.stage("decode"):
-                pixels_for_depth = _planes(photo.pixels())
-        return Draft(pixels_for_depth, depth, digest, left, view, scale, context, meta, rejected, meter.seconds)
+            with meter.stage("prepare"):
+                unseen = self._for_the_device(photo)
+        return Draft(unseen, depth, digest, left, view, scale, context, meta, rejected, meter.seconds)
+
+    def _for_the_device(self, photo: _Photo) -> Tensor:
+        pixels = _planes(photo.pixels()).unsqueeze(0)
+        network = as_network(self._recipe.depth)
+        if network is None:
+            return pixels
+        if self._preprocessing is None:
+            self._preprocessing = load_preprocessing(network)
+        return self._preprocessing.prepare(pixels)
 
     def _open(self, sources: SourceSet, choice: Choice, meter: Meter) -> _Photo:
         manifest = sources.manifests[choice.source]

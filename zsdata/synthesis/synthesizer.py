@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -73,12 +74,37 @@ def estimate_depth(depth: DepthEstimator, photos: Tensor, config: SynthesisConfi
         depth: an estimator as `load_depth` returns it.
         photos: float32 [B, 3, h, w], RGB 0..255.
     """
-    inverse_depth = normalize_inverse_depth(_checked(depth(photos), photos))
-    if config.flip_confidence:
-        mirrored = normalize_inverse_depth(_checked(depth(photos.flip(-1)), photos)).flip(-1)
-        confidence, consistency = flip_confidence(inverse_depth, mirrored), flip_consistency(inverse_depth, mirrored)
+    together = getattr(depth, "with_mirrored", None)
+    if not config.flip_confidence:
+        estimate, mirrored = depth(photos), None
+    elif together is not None:
+        estimate, mirrored = together(photos)
     else:
-        confidence, consistency = torch.ones_like(inverse_depth), torch.ones(len(photos), dtype=torch.float64)
+        estimate, mirrored = depth(photos), depth(photos.flip(-1)).flip(-1)
+    return _depth_maps(_checked(estimate, photos), None if mirrored is None else _checked(mirrored, photos))
+
+
+def predict_depth(depth: Any, prepared: Sequence[Tensor], sizes: Sequence[tuple[int, int]], config: SynthesisConfig) -> list[DepthMaps]:
+    """As `estimate_depth`, of photos of several sizes that an estimator with two halves has prepared elsewhere; one map per photo.
+
+    Args:
+        depth: an estimator with `predict` and `predict_mirrored`.
+        prepared: what its `prepare` made of each photo.
+        sizes: (height, width) of the photos.
+    """
+    if config.flip_confidence:
+        return [_depth_maps(estimate, mirrored) for estimate, mirrored in depth.predict_mirrored(prepared, sizes)]
+    return [_depth_maps(estimate, None) for estimate in depth.predict(prepared, sizes)]
+
+
+def _depth_maps(estimate: Tensor, mirrored: Tensor | None) -> DepthMaps:
+    """What is known from inverse depth and, in the same frame, that of the mirrored photo."""
+    inverse_depth = normalize_inverse_depth(estimate)
+    if mirrored is None:
+        confidence, consistency = torch.ones_like(inverse_depth), torch.ones(len(inverse_depth), dtype=torch.float64)
+    else:
+        mirrored = normalize_inverse_depth(mirrored)
+        confidence, consistency = flip_confidence(inverse_depth, mirrored), flip_consistency(inverse_depth, mirrored)
     return DepthMaps(
         (inverse_depth * NEAREST).round_().int().to(torch.uint16), (confidence * CERTAIN).round_().int().to(torch.uint8), consistency
     )

@@ -22,6 +22,15 @@ from zsdata.synthesis.depth.options import DepthNetwork
 DepthEstimator = Callable[[Tensor], Tensor]
 
 
+def as_network(depth: str | os.PathLike[str] | DepthNetwork | DepthEstimator) -> DepthNetwork | None:
+    """The network behind the stream's `depth` argument; None for the built-in estimator and for callables."""
+    if isinstance(depth, DepthNetwork):
+        return depth
+    if callable(depth) or os.fspath(depth) == "builtin":
+        return None
+    return DepthNetwork(os.fspath(depth))
+
+
 def load_depth(
     depth: str | os.PathLike[str] | DepthNetwork | DepthEstimator, device: str | torch.device = "cpu", **options: Any
 ) -> DepthEstimator:

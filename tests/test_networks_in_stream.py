@@ -1,0 +1,89 @@
+import json
+
+import pytest
+import torch
+
+from tests.scenes import grey_fill, layered_depth, photo_tar
+from zsdata import ZeroStereoStream
+from zsdata.licences import NonCommercialModel
+from zsdata.synthesis.depth import DepthNetwork
+from zsdata.synthesis.inpaint import DiffusionNetwork
+
+small = pytest.importorskip("tests.small_depth_networks")
+
+SIZE = (64, 96)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return small.save_small_network("depth_anything", tmp_path_factory.mktemp("networks") / "depth_anything")
+
+
+@pytest.fixture(scope="module")
+def tar(tmp_path_factory):
+    return photo_tar(tmp_path_factory.mktemp("tar") / "photos.tar", 6)
+
+
+def batches(stream, workers=2):
+    with stream.loader(3, num_workers=workers) as loader:
+        return list(loader)
+
+
+@pytest.mark.parametrize("options", [{}, {"views_per_image": 2}, {"depth_resolution": 70}], ids=str)
+def test_a_network_gives_the_same_labels_in_the_workers_and_on_the_device(folder, tar, tmp_path, options):
+    def run(**placement):
+        return batches(ZeroStereoStream(tar, size=SIZE, depth=folder, inpaint=grey_fill, **options, **placement))
+
+    in_workers, on_device = run(depth_placement="worker"), run(depth_placement="device")
+    cached = [run(depth_placement="device", depth_cache=tmp_path) for _ in range(2)][-1]
+    assert len(in_workers) == len(on_device) == len(cached) == 2 * options.get("views_per_image", 1)
+    for one, *others in zip(in_workers, on_device, cached, strict=True):
+        for other in others:
+            assert [meta["index"] for meta in one.meta] == [meta["index"] for meta in other.meta]
+            assert torch.allclose(one.disparity, other.disparity, atol=1e-4) and torch.allclose(one.confidence, other.confidence, atol=1e-2)
+            for mask, other_mask in zip(one.masks, other.masks, strict=True):
+                assert (mask != other_mask).float().mean() <= 0.001
+
+
+def test_the_resolution_reaches_the_network(folder, tar):
+    coarse, fine = (next(iter(ZeroStereoStream(tar, size=SIZE, depth=folder, depth_resolution=side))) for side in (42, 140))
+    assert not torch.equal(coarse.disparity, fine.disparity)
+    whole = ZeroStereoStream(tar, size=SIZE, depth=DepthNetwork(str(folder), resolution=42))
+    assert torch.equal(next(iter(whole)).disparity, coarse.disparity)
+    with pytest.raises(ValueError, match="depth_resolution belongs to a network"):
+        ZeroStereoStream(tar, depth=layered_depth, depth_resolution=42)
+
+
+def test_auto_keeps_depth_in_the_workers_where_the_loader_has_no_gpu(folder, tar):
+    with ZeroStereoStream(tar, size=SIZE, depth=folder).loader(3, num_workers=1) as loader:
+        next(iter(loader))
+        assert "prepare" not in loader.stats()["seconds"]
+
+
+def test_options_that_change_no_picture_do_not_change_the_place(folder, tar):
+    state = ZeroStereoStream(tar, size=SIZE, depth=DepthNetwork(str(folder), micro_batch=2)).state_dict()
+    ZeroStereoStream(tar, size=SIZE, depth=DepthNetwork(str(folder), micro_batch=16)).load_state_dict(state)
+    with pytest.raises(ValueError, match="configuration"):
+        ZeroStereoStream(tar, size=SIZE, depth=DepthNetwork(str(folder), resolution=42)).load_state_dict(state)
+
+
+def test_provenance_names_the_models_with_their_licences(folder, tar):
+    (folder / "README.md").write_text("---\nlicense: apache-2.0\n---\n# a card\n")
+    stream = ZeroStereoStream(
+        tar, size=SIZE, depth=folder, inpaint=DiffusionNetwork("Windsrain/ZeroStereo", subfolder="StereoGen", steps=4)
+    )
+    record = stream.provenance()
+    assert json.loads(json.dumps(record)) == record
+    assert record["depth"] == [{"id": str(folder), "revision": None, "licence": "apache-2.0"}]
+    assert record["inpaint"][0]["id"] == "Windsrain/ZeroStereo" and record["inpaint"][0]["licence"] == "mit"
+    builtin = ZeroStereoStream(tar, depth=layered_depth).provenance()
+    assert builtin["inpaint"] == [{"id": "builtin", "revision": None, "licence": "apache-2.0"}]
+
+
+@pytest.mark.parametrize("argument", ["depth", "inpaint"])
+def test_a_commercial_user_is_kept_from_non_commercial_models(tar, argument):
+    model = {"depth": "depth-anything/Depth-Anything-V2-Large-hf", "inpaint": "stabilityai/sd-turbo"}[argument]
+    options = {"depth": layered_depth, argument: model}
+    ZeroStereoStream(tar, **options)
+    with pytest.raises(NonCommercialModel, match=r"commercial_safe is set\. Take "):
+        ZeroStereoStream(tar, commercial_safe=True, **options)
