@@ -1,12 +1,19 @@
 """The benchmark of a stream: its figures fit together, and its advice names what they show. No test here knows how fast a machine is."""
 
+import importlib
+import json
 import re
+import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from zsdata import AugmentConfig, ZeroStereoStream, cli
 from zsdata.bench import BenchReport, Run, advice, bench, feed, fill_depth_cache, leave_holes, samples_needed
+from zsdata.export import export_pairs
+from zsdata.exported import read_exported
 
 from .scenes import grey_fill, jpeg, layered_depth, photo, photo_tar, write_tar
 
@@ -179,3 +186,50 @@ def test_a_missing_shard_is_told_before_anything_is_made(run, tmp_path):
 def test_leave_holes_returns_the_right_view():
     right = torch.rand(1, 3, 4, 4)
     assert leave_holes(right, torch.ones(1, 1, 4, 4, dtype=torch.bool), []) is right
+
+
+@pytest.mark.filterwarnings("ignore:The built-in depth")
+def test_the_benchmark_of_pairs_prints_its_tables_and_writes_them_down(tmp_path, capsys, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[1] / "benchmarks"))
+    pairs = importlib.import_module("pairs")
+    sizes = ((60, 80), (120, 160), (240, 320))  # in place of those of its tables
+    for table in ("TARGETS", "PUBLISHED_DECODES"):
+        monkeypatch.setattr(pairs, table, dict(zip(sizes, getattr(pairs, table).values(), strict=True)))
+    monkeypatch.setattr(pairs, "SIZES", sizes)
+    monkeypatch.setattr(pairs, "CROPS", (pairs.CROP,))
+    monkeypatch.setattr(pairs, "BATCH_SIZE", 1)
+    (tmp_path / "photos").mkdir()
+    for seed in range(3):
+        (tmp_path / "photos" / f"{seed}.jpg").write_bytes(jpeg(photo(seed)))
+    (tmp_path / "photos" / "notes.txt").write_text("not a photo")
+    options = ["--quick", "--workers", "1", "--photos", str(tmp_path / "photos"), "--json", str(tmp_path / "figures.json")]
+    monkeypatch.setattr(sys, "argv", ["pairs.py", *options])
+    pairs.main()
+
+    out, figures = capsys.readouterr().out, json.loads((tmp_path / "figures.json").read_text())
+    assert "60x80: 2 photos" in out and "240x320: 2 photos" in out and out.count("2 of them enlarged") == 1
+    for size in ("60x80", "120x160", "240x320"):
+        stages, read = figures["stages"][size], figures["reading"][size]
+        parts = ["read", "decode", "view", "depth, cached", "disparity", "sharpen", "warp", "other"]
+        assert all(stages[part]["ms"] > 0 for part in [*parts, "total", "depth, built-in"])
+        assert read["ms"]["worker"] == stages["total"]["ms"] and read["bytes_per_pair"] > 0
+        assert read["over"][1] < read["over"][0]  # augmentation comes on top of reading
+    assert figures["geometry"]["warp"]["growth"] > 0
+    assert [run["workers"] for run in figures["end_to_end"][1:]] == [0, 1]
+    assert all(run["pairs_per_second"] > 0 for run in figures["workers"])
+
+
+def test_reading_as_published_gives_a_training_sample(tmp_path, shard, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[1] / "benchmarks"))
+    published_set = importlib.import_module("published_set")
+    export_pairs(stream_of(shard, size=None, augmentation=AugmentConfig.none()), tmp_path / "pairs", pairs=1)
+    (pair,) = read_exported(tmp_path / "pairs")
+    made = [published_set.decode_and_augment(pair, np.random.RandomState(seed)) for seed in (0, 0, 1)]
+    images = {"left", "right", "left_clean", "right_clean"}
+    assert {name: tuple(values.shape) for name, values in made[0].items()} == {
+        name: (3 if name in images else 1, 384, 512) for name in made[0]
+    }
+    assert all(torch.equal(made[0][name], made[1][name]) for name in made[0])
+    assert not torch.equal(made[0]["left"], made[2]["left"])
+    assert all(set(made[0][name].unique().tolist()) <= {0.0, 1.0} for name in ("nonocclusion", "inpaint", "valid"))
+    assert 0 < made[0]["disparity"].min() and made[0]["left"].max() <= 255
