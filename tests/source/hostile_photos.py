@@ -237,6 +237,7 @@ def _damaged_jpegs() -> dict[str, Odd]:
         "jpeg of a start and an end": (b"\xff\xd8\xff\xd9" + bytes(10), "damaged"),
         "jpeg with an empty scan": (JPEG[: scan + 14] + b"\xff\xd9", "truncated"),
         "jpeg with a zeroed sector": (large[:8192] + bytes(4096) + large[8192 + 4096 :], "truncated"),
+        "jpeg with a zeroed sector that hides": (large_zeroed(), "damaged: zeros among the JPEG data"),
         "jpeg zeroed to its end": (large[:-4098] + bytes(4096) + large[-2:], "truncated"),
         "jpeg of noise": (b"\xff\xd8\xff" + random.Random(2).randbytes(5000) + b"\xff\xd9", EITHER),
     }  # fmt: skip
@@ -317,6 +318,12 @@ def _not_photos() -> dict[str, Odd]:
         "noise": (random.Random(6).randbytes(5000), "not a JPEG, PNG or WebP"),
     }  # fmt: skip
     return {name: Odd(*odd) for name, odd in files.items()}
+
+
+def large_zeroed() -> bytes:
+    """The first sector at which zeros stand for as many blocks as were there, so that the picture ends as it should."""
+    data = encode(photo(0, 480, 640), quality=90)
+    return data[:26624] + bytes(512) + data[26624 + 512 :]
 
 
 def over(data: bytes, place: int, new: bytes) -> bytes:

@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
 from zsdata.faults import BadPhoto
-from zsdata.source import jpeg
+from zsdata.source import jpeg, opencv
 from zsdata.source.photo import MAX_PIXELS, decode_photo, decode_rgb, photo_extension, probe_size
 
 from .images import encode, exif, over_white, picture, png, png_chunk
@@ -300,3 +300,96 @@ def test_decoding_looks_at_the_picture_once(monkeypatch):
     monkeypatch.setattr(jpeg, "decode_color", lambda *arguments: calls.append(1) or decode(*arguments))
     decode_rgb(encode(picture(200, 300)))
     assert len(calls) == 1
+
+
+def pieces(*parts):
+    return st.lists(st.one_of(st.sampled_from(parts), st.binary(max_size=20)), max_size=8).map(b"".join)
+
+
+JPEG_PIECES = pieces(
+    *(FILES["jpeg"][0][start:end] for start, end in ((2, 20), (20, 158), (158, 177), (177, 600), (-300, -2))),
+    b"\xff\xd9",
+    b"\xff\xda\0\x0c\3\1\0\2\x11\3\x11\0\x3f\0",
+    b"\xff\xc0\0\x0b\x08\0\x10\0\x10\1\1\x11\0",
+    b"\xff\xff\xff",
+    b"\xff\xe1\0\x08Exif\0\0",
+)
+PNG_PIECES = pieces(
+    png_chunk(b"IHDR", struct.pack(">IIBBBBB", 3, 2, 8, 2, 0, 0, 0)),
+    png_chunk(b"IHDR", struct.pack(">IIBBBBB", 3, 2, 16, 6, 0, 0, 1)),
+    png_chunk(b"IDAT", zlib.compress(bytes(20))),
+    png_chunk(b"PLTE", bytes(6)),
+    png_chunk(b"tRNS", b"\0\1"),
+    png_chunk(b"eXIf", b"II*\0"),
+    png_chunk(b"IEND", b""),
+    png_chunk(b"acTL", bytes(8)),
+)
+WEBP_PIECES = pieces(
+    FILES["webp"][0][12:], FILES["webp lossless"][0][12:], FILES["webp animated"][0][12:], FILES["webp"][0][12:30],
+    b"VP8X\x0a\0\0\0\2\0\0\0" + bytes(6), b"ALPH\4\0\0\0\0\0\0\0", b"EXIF\2\0\0\0II",
+)  # fmt: skip
+
+
+@given(
+    st.one_of(
+        JPEG_PIECES.map(b"\xff\xd8\xff".__add__),
+        PNG_PIECES.map(b"\x89PNG\r\n\x1a\n".__add__),
+        WEBP_PIECES.map(lambda body: b"RIFF" + struct.pack("<I", len(body) + 4) + b"WEBP" + body),
+    )
+)
+@settings(max_examples=600)
+def test_a_file_of_any_pieces_has_a_size_within_limits_and_a_picture_of_that_size_or_a_reason(data):
+    try:
+        width, height = probe_size(data)
+    except BadPhoto as fault:
+        assert fault.reason
+        with pytest.raises(BadPhoto):
+            decode_rgb(data)
+        return
+    assert 0 < width * height <= MAX_PIXELS
+    try:
+        assert decode_rgb(data).shape == (height, width, 3)
+    except BadPhoto as fault:
+        assert fault.reason
+
+
+def test_without_opencvs_own_rgb_the_colours_are_the_same(monkeypatch):
+    whole = decode_rgb(FILES["jpeg"][0])
+    monkeypatch.setattr(opencv, "_RGB", None)  # before OpenCV 4.11
+    assert np.array_equal(decode_rgb(FILES["jpeg"][0]), whole)
+
+
+def test_no_memory_is_no_fault_of_the_photo(monkeypatch):
+    def fail(code):
+        def imdecode(data, flags):
+            error = cv2.error("failed")
+            error.code = code
+            raise error
+
+        return imdecode
+
+    monkeypatch.setattr(cv2, "imdecode", fail(cv2.Error.StsNoMem))
+    with pytest.raises(MemoryError, match="no memory to decode a photo"):
+        decode_rgb(FILES["jpeg"][0])
+    monkeypatch.setattr(cv2, "imdecode", fail(cv2.Error.StsAssert))
+    with pytest.raises(BadPhoto, match="cannot be decoded"):
+        decode_rgb(FILES["jpeg"][0])
+
+
+def test_a_decoder_that_gives_something_else_is_not_believed(monkeypatch):
+    monkeypatch.setattr(cv2, "imdecode", lambda data, flags: np.zeros((5, 5, 3), np.float32))
+    with pytest.raises(BadPhoto, match=r"decodes to float32 \(5, 5, 3\)"):
+        decode_rgb(FILES["png alpha"][0])
+    monkeypatch.setattr(cv2, "imdecode", lambda data, flags: np.zeros((5, 6, 3), np.uint8))
+    with pytest.raises(BadPhoto, match="6 x 5 pixels where the header says 51 x 37"):
+        decode_rgb(FILES["png"][0])
+    with pytest.raises(BadPhoto, match="where the header says 51 x 37, at one part in 2"):
+        decode_rgb(FILES["jpeg"][0], reduction=2)
+
+
+def test_a_large_photo_that_is_decoded_at_a_part_needs_the_memory_of_that_part():
+    grey = encode(np.full((9000, 9000), 99, np.uint8))
+    with pytest.raises(BadPhoto, match="too large: 9,000 x 9,000 pixels take 486 MB to decode, at most 380"):
+        decode_rgb(grey)
+    assert probe_size(grey) == (9000, 9000)
+    assert decode_rgb(grey, reduction=8).shape == (1125, 1125, 3)

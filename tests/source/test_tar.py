@@ -1,6 +1,7 @@
 """The tar walk against Python's tarfile, and against damage."""
 
 import io
+import itertools
 import tarfile
 
 import pytest
@@ -321,6 +322,27 @@ def test_a_sparse_file_is_told_apart():
     assert (member.name, member.kind) == ("a.jpg", "sparse")
 
 
+def test_the_long_target_of_a_link_is_stepped_over():
+    target = raw_header(b"././@LongLink", size=b"%011o\0" % 200, kind=b"K") + b"t" * 199 + bytes(313)
+    found = walk_tar(BytesShard(target + raw_header(b"link.jpg", kind=b"2") + raw_header() + BODY + END))
+    assert [(member.name, member.kind) for member in found] == [("link.jpg", "link"), ("a.jpg", "file")]
+
+
+@pytest.mark.parametrize("extension", [raw_header(kind=b"L", size=b"00000000000\0"), pax(b"12 path=a\0b\n")], ids=["empty", "null"])
+def test_a_name_of_nothing_or_with_a_null_is_damage_and_its_member_lost(extension):
+    faults = []
+    assert walk(extension + raw_header() + BODY + raw_header(b"z.jpg") + BODY + END, faults.append) == [("z.jpg", b"12345")]
+    assert [("name" in fault.reason or "pax" in fault.reason) for fault in faults] == [True, True]
+
+
+def test_the_name_of_an_author_is_no_header():
+    entries = [("a.jpg", b"ustar" * 200), ("b.jpg", b"b")]
+    data = write_tar(entries)
+    assert tar.find_header(entries[0][1]) == -1
+    faults = []
+    assert walk(bytes([data[0] ^ 1]) + data[1:], faults.append) == entries[1:]
+
+
 def test_an_archive_of_nothing_but_a_comment_is_whole():
     body = b"17 comment=hello\n"
     assert walk(raw_header(kind=b"g", size=b"%011o\0" % len(body)) + body + bytes(512 - len(body)) + END) == []
@@ -349,6 +371,32 @@ def test_global_pax_records_count_for_every_member_after_them():
 def test_other_files_are_named(start, says):
     with pytest.raises(BadShard, match=says):
         walk(start + b"\x55" * 2000)
+
+
+def size_record(size):
+    return b"%d size=%d\n" % (len(str(size)) + 9, size)
+
+
+kinds = st.sampled_from([b"0", b"1", b"2", b"5", b"L", b"K", b"x", b"g", b"S", b"7", b"Z"])
+headers = st.builds(
+    lambda name, kind, size: raw_header(name, b"%011o\0" % size, kind), st.binary(max_size=100), kinds, st.integers(0, 3000)
+)
+extensions = st.builds(pax, st.one_of(st.binary(max_size=60), st.integers(0, 2000).map(size_record), st.just(b"14 path=xx.jpg\n")))
+blocks = st.one_of(headers, extensions, st.binary(min_size=512, max_size=512), st.just(bytes(512)), st.binary(max_size=700))
+
+
+@given(st.lists(blocks, max_size=12))
+@settings(max_examples=400)
+def test_blocks_in_any_order_end_the_walk_with_members_inside_the_file_that_do_not_overlap(parts):
+    data, faults = b"".join(parts), []
+    members = list(walk_tar(BytesShard(data), faults.append))
+    assert all(0 <= member.offset and member.offset + member.size <= len(data) for member in members)
+    assert all(before.offset + before.size <= after.offset for before, after in itertools.pairwise(members))
+    assert all(0 <= fault.offset <= len(data) and fault.reason for fault in faults)
+    try:
+        assert list(walk_tar(BytesShard(data))) == members and not faults
+    except BadShard:
+        assert faults
 
 
 @given(st.binary(max_size=3000), st.integers(0, 3))
