@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import multiprocessing
 import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -58,14 +59,21 @@ class StereoLoader:
         timeout_seconds: float,
         rejected: str | os.PathLike[str] | None,
     ) -> None:
-        if batch_size < 1:
-            raise ValueError(f"batch_size is 1 or more; got {batch_size}")
-        if num_workers < 0:
-            raise ValueError(f"num_workers is 0 or more; got {num_workers}")
-        if not 0 <= rank < world_size:
+        for name, value, least in (
+            ("batch_size", batch_size, 1),
+            ("num_workers", num_workers, 0),
+            ("rank", rank, 0),
+            ("world_size", world_size, 1),
+        ):
+            if isinstance(value, bool) or not isinstance(value, int) or value < least:
+                raise ValueError(f"{name} is an integer, {least} or more; got {value!r}")
+        if rank >= world_size:
             raise ValueError(f"rank is in 0..world_size - 1; got rank {rank} of {world_size}")
-        if not timeout_seconds > 0:
-            raise ValueError(f"timeout_seconds is above 0; got {timeout_seconds}")
+        if not isinstance(timeout_seconds, (int, float)) or not timeout_seconds > 0:
+            raise ValueError(f"timeout_seconds is above 0; got {timeout_seconds!r}")
+        if multiprocessing_context not in (None, *multiprocessing.get_all_start_methods()):
+            methods = ", ".join(multiprocessing.get_all_start_methods())
+            raise ValueError(f"multiprocessing_context is one of {methods}, or None; got {multiprocessing_context!r}")
         self.batch_size = batch_size
         self.rank = rank
         self.world_size = world_size
