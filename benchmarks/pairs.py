@@ -25,7 +25,7 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
 from importlib.metadata import version
@@ -60,6 +60,7 @@ SIZES = ((480, 640), (768, 1024), (1536, 2048))
 CROPS = ((256, 320), CROP, (512, 768))
 JPEG_QUALITY = 92
 BATCH_SIZE = 8
+MOST_SECONDS = 40  # for the rounds of one table; what a busy machine does not finish is left out
 SCALE = 0.1  # largest disparity as a share of the width, the paper's centre
 TARGETS = {SIZES[0]: (1.0, 0.2), SIZES[1]: (0.6, 0.1), SIZES[2]: (0.3, 0.03)}  # over reading: decode only, with augmentation
 WARP_DECODES, WARP_GROWTH, CUDA_MS = 7.0, 4.6, 2.0  # targets of the geometry
@@ -117,7 +118,7 @@ def in_turn(work: Mapping[str, Callable[[int, int], object]], photos: int, round
     """
     times: dict[str, np.ndarray] = {}
     with tqdm(total=rounds * len(work), desc=title, disable=None, leave=False) as bar, stages_by_thread_time():
-        for number in range(rounds):
+        for number in rounds_in_time(rounds):
             for name, do in work.items():
                 for photo in range(photos):
                     start = time.thread_time()
@@ -128,7 +129,16 @@ def in_turn(work: Mapping[str, Callable[[int, int], object]], photos: int, round
                     for key, value in seconds.items():
                         times.setdefault(key, np.zeros(rounds))[number] += 1e3 * value / photos
                 bar.update()
-    return times
+    return {name: ms[: number + 1] for name, ms in times.items()}
+
+
+def rounds_in_time(most: int) -> Iterator[int]:
+    """0, 1, ...: `most` rounds, fewer where they take longer than MOST_SECONDS together, one at least."""
+    start = time.perf_counter()
+    for number in range(most):
+        yield number
+        if time.perf_counter() - start > MOST_SECONDS:
+            return
 
 
 def stages_by_thread_time() -> AbstractContextManager[object]:
@@ -138,6 +148,12 @@ def stages_by_thread_time() -> AbstractContextManager[object]:
 
 def ratio(times: Times, name: str, reference: str) -> float:
     return float(np.median(times[name] / times[reference]))
+
+
+def spread(times: Times, name: str, reference: str) -> list[float]:
+    """The least and the largest ratio of a round."""
+    ratios = times[name] / times[reference]
+    return [float(ratios.min()), float(ratios.max())]
 
 
 def against_reading(photos: PhotoSet, rounds: int) -> Times:
@@ -204,8 +220,8 @@ def print_stages(sets: Sequence[PhotoSet], cached: Mapping[str, Times], estimate
 def print_reading(sets: Sequence[PhotoSet], cached: Mapping[str, Times]) -> dict[str, Any]:
     print("\na worker's pair against reading a finished one, on one thread")
     print(
-        f"{'photo':>10}{'MB a pair':>10} | {'worker ms':>9}{'read ms':>9}{'+ augment':>10} | {'over read':>10}{'target':>7}"
-        f"{'over + augment':>16}{'target':>7} | reading, in decodes (the published code)"
+        f"{'photo':>10}{'MB a pair':>10} | {'worker ms':>9}{'read ms':>9}{'+ augment':>10} | {'over read, least..most':>26}{'target':>7}"
+        f"{'over + augment':>25}{'target':>7} | reading, in decodes (the published code)"
     )
     figures = {}
     for photos in sets:
@@ -213,40 +229,53 @@ def print_reading(sets: Sequence[PhotoSet], cached: Mapping[str, Times]) -> dict
         ratios = [ratio(times, "worker", reference) for reference in ("read", "read and augment")]
         decodes = [ratio(times, name, "decode") for name in ("read", "read and augment")]
         ms = {name: float(np.median(times[name])) for name in ("worker", "read", "read and augment")}
+        spreads = [spread(times, "worker", reference) for reference in ("read", "read and augment")]
         marks = ["" if value <= target else " !" for value, target in zip(ratios, targets, strict=True)]
         print(
             f"{photos.name:>10}{photos.bytes_per_pair / 1e6:10.1f} | {ms['worker']:9.1f}{ms['read']:9.1f}{ms['read and augment']:10.1f} | "
-            f"{ratios[0]:10.2f}{targets[0]:7}{marks[0]:2}{ratios[1]:14.3f}{targets[1]:7}{marks[1]:2}| "
+            f"{ratios[0]:10.2f}  ({spreads[0][0]:4.2f}..{spreads[0][1]:4.2f}){targets[0]:9}{marks[0]:2}"
+            f"{ratios[1]:9.3f}  ({spreads[1][0]:5.3f}..{spreads[1][1]:5.3f}){targets[1]:7}{marks[1]:2}| "
             + ", ".join(f"{here:.0f} ({there:.0f})" for here, there in zip(decodes, PUBLISHED_DECODES[photos.size], strict=True))
         )
-        figures[photos.name] = {"ms": ms, "over": ratios, "targets": targets, "decodes": decodes, "bytes_per_pair": photos.bytes_per_pair}
+        figures[photos.name] = {
+            "ms": ms,
+            "over": ratios,
+            "least_and_most": spreads,
+            "targets": targets,
+            "decodes": decodes,
+            "bytes_per_pair": photos.bytes_per_pair,
+        }
     return figures
 
 
-def print_rates(
-    sets: Sequence[PhotoSet], workers: Sequence[int], cached: Mapping[str, Times], pairs: int, rounds: int
-) -> list[dict[str, Any]]:
+def print_rates(sets: Sequence[PhotoSet], workers: Sequence[int], pairs: int, rounds: int) -> list[dict[str, Any]]:
     """What workers deliver: by photo size and crop, in turn; the training process only takes the batches."""
     middle = sets[len(sets) // 2]
     kinds = [(photos, CROP) for photos in sets] + [(middle, crop) for crop in CROPS if crop != CROP]
-    runs = [(photos, crop, count, photos.stream(crop, finished=False, epoch_size=10**6)) for photos, crop in kinds for count in workers]
-    rates = np.zeros((rounds, len(runs)))
-    with tqdm(total=rounds * len(runs), desc="pairs per second", unit="run", disable=None, leave=False) as bar:
-        for number in range(rounds):
-            for i, (_, _, count, stream) in enumerate(runs):
-                batches = max(2 * count, pairs // BATCH_SIZE)
-                rates[number, i] = feed(stream, count, batch_size=BATCH_SIZE, batches=batches).pairs_per_second
+    streams = [photos.stream(crop, finished=False, epoch_size=10**6) for photos, crop in kinds]
+    rates: dict[tuple[int, int], list[tuple[float, float]]] = {}  # (kind, workers) -> pairs per second, over reading, by round
+    with tqdm(total=rounds * len(kinds), desc="pairs per second", disable=None, leave=False) as bar:
+        for _ in rounds_in_time(rounds):
+            for kind, (photos, _) in enumerate(kinds):
+                start = time.perf_counter()
+                for pair in photos.exported:
+                    decode(pair)
+                reading = len(photos.exported) / (time.perf_counter() - start)
+                for count in workers:
+                    batches = max(2 * count, pairs // BATCH_SIZE)
+                    rate = feed(streams[kind], count, batch_size=BATCH_SIZE, batches=batches).pairs_per_second
+                    rates.setdefault((kind, count), []).append((rate, rate / reading))
                 bar.update()
-    print(f"\nwhat workers deliver, batches of {BATCH_SIZE} (over one process that only reads finished pairs of such photos)")
+    print(f"\nwhat workers deliver, batches of {BATCH_SIZE} (over one process that reads finished pairs of such photos and does no more)")
     print(f"{'photo':>10}{'crop':>10}" + "".join(f"{f'workers: {count}':>24}" for count in workers))
     figures = []
-    for i, (photos, crop, count, _) in enumerate(runs):
-        if count == workers[0]:
-            print(f"{photos.name:>10}{f'{crop[0]}x{crop[1]}':>10}", end="")  # one line for all numbers of workers
-        rate = float(np.median(rates[:, i]))
-        over = rate * float(np.median(cached[photos.name]["read"])) / 1e3
-        print(f"{rate:10.1f} pairs/s ({over:4.1f})", end="\n" if count == workers[-1] else "")
-        figures.append({"photo": photos.size, "crop": crop, "workers": count, "pairs_per_second": rate, "over_reading": over})
+    for kind, (photos, crop) in enumerate(kinds):
+        cells = []
+        for count in workers:
+            rate, over = np.median(rates[kind, count], axis=0).tolist()
+            cells.append(f"{rate:10.1f} pairs/s ({over:4.2f})")
+            figures.append({"photo": photos.size, "crop": crop, "workers": count, "pairs_per_second": rate, "over_reading": over})
+        print(f"{photos.name:>10}{f'{crop[0]}x{crop[1]}':>10}" + "".join(cells))
     return figures
 
 
@@ -255,7 +284,7 @@ def print_end_to_end(photos: PhotoSet, workers: Sequence[int], device: torch.dev
     stream, counts = photos.stream(epoch_size=10**6), [0, *workers]
     runs = {count: [] for count in counts}
     with tqdm(total=rounds * len(counts), desc=f"finished batches on {device}", unit="run", disable=None, leave=False) as bar:
-        for _ in range(rounds):
+        for _ in rounds_in_time(rounds):
             for count in counts:
                 batches = max(2 * count, pairs // BATCH_SIZE)
                 runs[count].append(feed(stream, count, batch_size=BATCH_SIZE, batches=batches, device=device))
@@ -452,7 +481,7 @@ def measure(folder: Path, options: argparse.Namespace, device: torch.device) -> 
     figures["geometry"] = print_geometry(sets, rounds)
     workers = sorted(set(options.workers))
     few = max(1, rounds // 2)
-    figures["workers"] = print_rates(sets, workers, cached, pairs, few)
+    figures["workers"] = print_rates(sets, workers, pairs, few)
     figures["end_to_end"] = print_end_to_end(sets[1], workers, device, pairs, few)
     if device.type == "cuda":
         figures["cuda"] = print_cuda(sets[1], device, 10 * rounds)
