@@ -157,11 +157,13 @@ def test_the_micro_batch_changes_no_more_than_rounding(folder, inpainter, micro_
     expected = inpainter(right, inpaint_mask, generators(*range(8)))
     together, seen = load_inpainter(folder, steps=3), []
     together.micro_batch.size = micro_batch
-    unet, encode = together._unet.forward, together._autoencoder.encode
+    unet, encode, decode = together._unet.forward, together._autoencoder.encode, together._autoencoder.decode
+    decoded = []
     monkeypatch.setattr(together._unet, "forward", lambda noisy, *_, **__: seen.append(len(noisy)) or unet(noisy, *_, **__))
     monkeypatch.setattr(together._autoencoder, "encode", lambda images: seen.append(-len(images)) or encode(images))
+    monkeypatch.setattr(together._autoencoder, "decode", lambda latents: decoded.append(len(latents)) or decode(latents))
     made = together(right, inpaint_mask, generators(*range(8)))
-    assert max(seen) == micro_batch and min(seen) == -min(micro_batch, AUTOENCODER_BATCH)
+    assert max(seen) == micro_batch and -min(seen) == max(decoded) == min(micro_batch, AUTOENCODER_BATCH)
     assert torch.allclose(made, expected, rtol=0, atol=1e-4 * 127.5)
 
 
