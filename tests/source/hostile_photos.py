@@ -157,6 +157,7 @@ def _lying() -> dict[str, Odd]:
         "jpeg says arithmetic coding": (over(JPEG, frame + 1, b"\xc9"), "not supported"),
         "jpeg says lossless": (over(JPEG, frame + 1, b"\xc3"), "not supported"),
         "jpeg says hierarchical": (over(JPEG, frame + 1, b"\xc5"), "not supported"),
+        "jpeg says two channels": (over(JPEG, frame + 9, b"\x02"), "damaged: a JPEG of 2 channels"),
         "jpeg says five channels": (over(JPEG, frame + 9, b"\x05"), "damaged"),
         "jpeg says 255 channels": (over(JPEG, frame + 9, b"\xff"), "damaged"),
         "jpeg says no sampling": (over(JPEG, frame + 11, b"\0"), "damaged"),

@@ -106,6 +106,8 @@ def test_a_shard_that_was_not_written_to_its_end_is_damage_even_where_a_photo_be
     faults = []
     assert [key for key, _ in read_shard(url, faults.append)] == ["a", "b"]
     assert [fault.reason for fault in faults] == ['zeros from inside "b" to the end: more may be missing; download it again']
+    with pytest.raises(BadShard, match='zeros from inside "b" to the end'):
+        list(read_shard(url))
 
 
 def test_other_image_formats_are_reported_by_name(shard):

@@ -181,6 +181,13 @@ def _refuse(path, beside):
         raise PermissionError(13, "Permission denied", str(path))
 
 
+def test_where_neither_can_be_written_the_error_is_told(tmp_path, monkeypatch):
+    shard = photo_tar(tmp_path / "a.tar", count=1)
+    monkeypatch.setattr(index.Path, "write_text", lambda path, *rest, **more: _refuse(path, "/"))
+    with pytest.raises(PermissionError):
+        write_index(shard)
+
+
 def test_the_index_of_a_remote_shard_is_in_the_cache_and_goes_stale_with_it(tmp_path, cache, caplog):
     memory = fsspec.filesystem("memory")
     data = Path(photo_tar(tmp_path / "a.tar", count=2)).read_bytes()

@@ -179,23 +179,26 @@ def _stamp(url: str) -> dict[str, Any]:
 
 
 def _store(url: str, text: str) -> str:
-    """Writes an index where it may be; whoever reads at the same time gets the old one or the new one."""
-    *places, last = _places(url)
-    for path in (*places, last):
-        partial = f"{path}.{os.getpid()}.partial"
+    """Writes an index where it may be."""
+    *beside, cached = _places(url)
+    for path in beside:
         try:
-            if path == last:
-                os.makedirs(os.path.dirname(path), exist_ok=True)
-            try:
-                Path(partial).write_text(text, encoding="ascii")
-                os.replace(partial, path)
-            finally:
-                Path(partial).unlink(missing_ok=True)
-            return path
-        except OSError:
-            if path == last:
-                raise
-    raise AssertionError("unreachable")
+            return _replace(path, text)
+        except OSError:  # the folder cannot be written
+            continue
+    os.makedirs(os.path.dirname(cached), exist_ok=True)
+    return _replace(cached, text)
+
+
+def _replace(path: str, text: str) -> str:
+    """Whoever reads at the same time gets the old one or the new one."""
+    partial = Path(f"{path}.{os.getpid()}.partial")
+    try:
+        partial.write_text(text, encoding="ascii")
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return path
 
 
 def _to_json(url: str, stamp: dict[str, Any], listing: Listing) -> str:
