@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -17,6 +18,7 @@ PIECE_BYTES = 1 << 20  # asked for at a time: fsspec does not say how far it is,
 RECHECK_SECONDS = 60.0  # a shard that was looked at for so long is looked at again; each look is a request
 STAMP_NAMES = ("ETag", "etag", "Content-MD5", "md5Hash", "Last-Modified", "LastModified", "updated", "blob_id", "mtime", "created")
 
+_systems: dict[str, tuple[int, Any, str]] = {}  # by url: the process, its file system and the path in it
 _looked: dict[str, tuple[float, Stamp]] = {}  # when, and what it was
 
 
@@ -30,21 +32,18 @@ def fetch_fsspec(url: str, offset: int, size: int, data: bytearray, check: Calla
 
     The shard is looked at before the first read of a process, after RECHECK_SECONDS, and around a read that takes several requests.
     """
-    try:
-        file_system, path = url_to_fs(url)  # asked for anew each time, so that a forked process gets its own
-    except ImportError as error:
-        raise ImportError(f'{without_secrets(f"{url}: {error}")}; pip install "zsdata[remote]" brings what s3, gs and hf need') from None
-    except Exception as error:
-        raise _fault_of(error) from None
     several = size > PIECE_BYTES or bool(data)
-    stamp = _look(url, file_system, path, again=several)
+    limit = time.monotonic() + retry.STALL_SECONDS
+    file_system, path = _opened(url, limit)
+    stamp = _look(url, file_system, path, limit, again=several)
     check(stamp)
     total = stamp["size"]
     assert isinstance(total, int)
     end = min(offset + size, total)
     while offset < end:
         stop = min(end, offset + PIECE_BYTES)
-        piece = _call(lambda start=offset, stop=stop: file_system.cat_file(path, start=start, end=stop))
+        piece = _call(lambda start=offset, stop=stop: file_system.cat_file(path, start=start, end=stop), limit)
+        limit = time.monotonic() + retry.STALL_SECONDS
         if len(piece) > stop - offset:
             raise RemoteFault("the server ignores ranges", again=False, cure="download the shard or use another server")
         data += piece
@@ -52,16 +51,34 @@ def fetch_fsspec(url: str, offset: int, size: int, data: bytearray, check: Calla
             raise RemoteFault("the connection ends too early", again=True)
         offset = stop
     if several:
-        check(_look(url, file_system, path, again=True))
+        check(_look(url, file_system, path, limit, again=True))
     return end == total
 
 
-def _look(url: str, file_system: Any, path: str, *, again: bool) -> Stamp:
+def _opened(url: str, limit: float) -> tuple[Any, str]:
+    """The file system of a url and the path in it; a forked process gets its own."""
+    process, file_system, path = _systems.get(url, (0, None, ""))
+    if process != os.getpid():
+        try:
+            file_system, path = _call(lambda: url_to_fs(url), limit)
+        except ImportError as error:
+            raise ImportError(
+                f'{without_secrets(f"{url}: {error}")}; pip install "zsdata[remote]" brings what s3, gs and hf need'
+            ) from None
+        _systems[url] = os.getpid(), file_system, path
+    return file_system, path
+
+
+def _look(url: str, file_system: Any, path: str, limit: float, *, again: bool) -> Stamp:
     """The stamp of a shard, as it is now or, without `again`, as it was a short time ago."""
     seconds, stamp = _looked.get(url, (0.0, {}))
     if again or not stamp or time.monotonic() - seconds > RECHECK_SECONDS:
-        _call(lambda: file_system.invalidate_cache(path))
-        info = _call(lambda: file_system.info(path))
+
+        def look() -> Any:
+            file_system.invalidate_cache(path)
+            return file_system.info(path)
+
+        info = _call(look, limit)
         size = info.get("size")
         if not isinstance(size, int):
             raise RemoteFault("the server does not say how large the file is", again=False, cure="download the shard")
@@ -71,9 +88,11 @@ def _look(url: str, file_system: Any, path: str, *, again: bool) -> Stamp:
     return stamp
 
 
-def _call(call: Callable[[], Any]) -> Any:
+def _call(call: Callable[[], Any], limit: float) -> Any:
     try:
-        return within(retry.STALL_SECONDS, call)
+        return within(max(0.0, limit - time.monotonic()), call)
+    except ImportError:
+        raise
     except Exception as error:
         raise _fault_of(error) from None
 
