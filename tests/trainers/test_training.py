@@ -261,7 +261,7 @@ def test_too_many_skipped_steps_in_a_row_are_an_error_and_the_run_can_be_resumed
         loss, metrics = PAPERS_LOSS(initial, sequence, batch)
         return loss * float("inf"), metrics
 
-    settings = config(steps=20)
+    settings = config(steps=MOST_SKIPPED_IN_A_ROW + 1)
     with pytest.raises(TrainingDiverged, match=rf"the loss is inf at step {MOST_SKIPPED_IN_A_ROW - 1}.*skipped.jsonl.*replay"):
         run_training(tar, tmp_path / "run", settings, loss=broken)
     AcceleratorState._reset_state(reset_partial_state=True)
@@ -362,11 +362,10 @@ def test_two_ranks_train_as_one_with_twice_the_batch_and_one_goes_on_where_two_s
     logs = [read_lines(folder / "log.jsonl") for folder in (two, one, resumed)]
     assert [line["samples"] for line in logs[0]] == [line["samples"] for line in logs[1]] == [2, 4, 6, 0]
     assert [(line["step"], line["samples"]) for line in logs[2]] == [(3, 6), (4, 0)]
-    for name in ("loss", "epe", "bad_1", "disparity_term", "photometric_term", "gradient_norm"):
+    for name in ("loss", "epe", "disparity_term", "photometric_term", "gradient_norm"):
         curves = [[line[name] for line in log] for log in logs]
-        assert curves[1] == pytest.approx(curves[0], rel=2e-3), name
-        assert curves[2] == pytest.approx(curves[0][2:], rel=2e-3), name
-    assert logs[1][0]["loss"] == pytest.approx(logs[0][0]["loss"], rel=1e-5)
+        assert curves[1] == pytest.approx(curves[0], rel=1e-5), name
+        assert curves[2] == pytest.approx(curves[0][2:], rel=1e-5), name
 
 
 def test_a_nan_on_one_rank_skips_the_step_on_both(tar, tmp_path):
