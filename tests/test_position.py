@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsdata.position import Position
+from zsdata.position import Position, require_one_place
 
 HERE = Position(seed=7, epoch=3, samples=40, manifest="a" * 64, configuration="b" * 64)
 STATE = HERE.to_state()
@@ -66,3 +66,11 @@ def test_a_refusal_is_short_whatever_the_state_holds():
 def test_the_largest_state_is_small():
     place = Position(seed=2**63 - 1, epoch=2**63 - 1, samples=2**63 - 1, manifest="f" * 64, configuration="f" * 64)
     assert len(json.dumps(place.to_state())) < 400
+
+
+def test_ranks_that_stand_elsewhere_are_named():
+    require_one_place([STATE] * 3)
+    with pytest.raises(ValueError, match="rank 2 differs from rank 0: its samples is 48, not 40: they stand at different places"):
+        require_one_place([STATE, STATE, {**STATE, "samples": 48}])
+    with pytest.raises(ValueError, match="rank 1 differs from rank 0: its manifest is 'c', not 'a+': the photos, their order"):
+        require_one_place([STATE, {**STATE, "manifest": "c"}])

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 VERSION = 1
+CAUSES = {  # of a difference, by field
+    "seed": "the stream's seed differs",
+    "manifest": "the photos, their order, the sources or epoch_size differ",
+    "configuration": "an option of the stream differs (size, depth, inpaint, disparity, view, augmentation, ...)",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,15 +47,28 @@ class Position:
         for name in ("epoch", "samples"):
             if type(state[name]) is not int or not 0 <= state[name] < 2**63:
                 raise ValueError(f"the state's {name} must be an integer in 0..2^63 - 1; got {reprlib.repr(state[name])}")
-        causes = {
-            "seed": "the stream's seed differs",
-            "manifest": "the photos, their order, the sources or epoch_size differ",
-            "configuration": "an option of the stream differs (size, depth, inpaint, disparity, view, augmentation, ...)",
-        }
-        for name, cause in causes.items():
+        for name, cause in CAUSES.items():
             if type(state[name]) is not type(getattr(expected, name)) or state[name] != getattr(expected, name):
                 raise ValueError(
                     f"the state's {name} is {reprlib.repr(state[name])}, this stream's is {getattr(expected, name)!r}: {cause}. "
                     "Open the stream as it was when the state was saved, or start anew without it."
                 )
         return Position(**{name: state[name] for name in names - {"version"}})
+
+
+def require_one_place(states: Sequence[Mapping[str, Any]]) -> None:
+    """Checks that all ranks are about to give out parts of the same batches; to be called where the ranks talk to each other anyway.
+
+    A shard that is cut on one node alone would otherwise give that rank other photos, or fewer batches, and the others would wait for ever.
+
+    Args:
+        states: `state_dict()` of every rank's loader, in the order of the ranks.
+
+    Raises:
+        ValueError: names the rank and the field that differs from rank 0's.
+    """
+    for rank, state in enumerate(states):
+        for name, value in states[0].items():
+            if state.get(name) != value:
+                cause = CAUSES.get(name, "they stand at different places; load the same state on all of them")
+                raise ValueError(f"rank {rank} differs from rank 0: its {name} is {state.get(name)!r}, not {value!r}: {cause}")

@@ -1,0 +1,159 @@
+"""Several ranks (gloo): whatever goes wrong on one of them, all end, and it is named."""
+
+import logging
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import redirect_stderr, redirect_stdout
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+import torch.distributed as dist
+
+from tests.scenes import grey_fill, photo_tar
+from tests.test_stream import open_stream
+from zsdata.faults import FailureBudget
+from zsdata.position import require_one_place
+
+LIMIT_SECONDS = 60
+TROUBLED = 1  # the rank
+
+
+def nan_fill(right, inpaint_mask, generators):
+    return right * float("nan")
+
+
+def train(rank, world, store, tar, case, workers):
+    """One rank: a step is a batch and a gradient that all ranks share, as in distributed training."""
+    options, troubled = {}, rank == TROUBLED
+    if case == "nan":
+        options["inpaint"] = nan_fill if troubled else grey_fill
+    if case == "bad shard, budget spent":
+        options["budget"] = FailureBudget(count=0, rate=0.1)
+    if case.startswith("bad shard") and troubled:
+        damage(tar)
+    if case == "cut shard" and troubled:
+        data = Path(tar).read_bytes()
+        Path(tar).write_bytes(data[: len(data) // 2])
+    stream = open_stream(tar, epoch_size=8 * world, **options)
+    dist.init_process_group("gloo", init_method=f"file://{store}", rank=rank, world_size=world, timeout=timedelta(seconds=LIMIT_SECONDS))
+    if case == "cut shard":
+        states: list = [None] * world
+        dist.all_gather_object(states, stream.state_dict())
+        require_one_place(states)
+    steps = 0
+    with stream.loader(2, num_workers=workers, rank=rank, world_size=world) as loader:
+        for batch in loader:
+            gradient = batch.left.mean()
+            dist.all_reduce(gradient)
+            steps += 1
+            if case == "killed" and troubled and steps == 2:
+                os.kill(os.getpid(), signal.SIGKILL)
+        sys.stdout.write(f"rank {rank}: {steps} steps, {loader.stats()['rejected']}\n")
+    dist.destroy_process_group()
+
+
+def damage(tar):
+    """Half of the photos of this rank's copy are none any more; the tar around them is whole."""
+    path = Path(tar)
+    data = bytearray(path.read_bytes())
+    start = 0
+    for number in range(4):
+        start = data.index(b"\xff\xd8\xff", start + 1)
+        if number % 2:
+            data[start : start + 40] = bytes(40)
+    path.write_bytes(data)
+
+
+def run_rank(rank, log, *arguments):
+    """Into a file of its own, as a launcher does it."""
+    with open(log, "w") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+        with redirect_stdout(file), redirect_stderr(file):
+            logging.basicConfig(force=True)
+            train(rank, *arguments)
+
+
+def launch(folder, world, case, workers):
+    """The exit code and the output of every rank; each has its own copy of the only shard."""
+    context, ranks = multiprocessing.get_context("fork"), []
+    for rank in range(world):
+        (folder / str(rank)).mkdir()
+        tar = photo_tar(folder / str(rank) / "photos.tar", 4)
+        arguments = (rank, folder / f"{rank}.log", world, folder / "store", tar, case, workers)
+        ranks.append(context.Process(target=run_rank, args=arguments))
+    start = time.monotonic()
+    for process in ranks:
+        process.start()
+    for process in ranks:
+        process.join(max(0.0, start + LIMIT_SECONDS - time.monotonic()))
+    hung = [rank for rank, process in enumerate(ranks) if process.exitcode is None]
+    for process in ranks:
+        process.kill()
+    assert not hung, f"ranks {hung} hang"
+    return [process.exitcode for process in ranks], [(folder / f"{rank}.log").read_text() for rank in range(world)]
+
+
+WORLDS = [2, pytest.param(3, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("workers", [0, 1])
+def test_more_ranks_than_shards_take_equal_steps_and_end(tmp_path, world, workers):
+    codes, outputs = launch(tmp_path, world, "few shards", workers)
+    assert codes == [0] * world and outputs == [f"rank {rank}: 4 steps, {{}}\n" for rank in range(world)]
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_a_bad_shard_on_one_rank_is_counted_there_and_the_steps_stay_equal(tmp_path, world):
+    codes, outputs = launch(tmp_path, world, "bad shard", 1)
+    assert codes == [0] * world
+    for rank, output in enumerate(outputs):
+        assert f"rank {rank}: 4 steps" in output and ("not a JPEG" in output) == (rank == TROUBLED)
+
+
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize(
+    ("case", "message"),
+    [
+        ("bad shard, budget spent", f"rank {TROUBLED} of {{world}} stops: TooManyFaults: "),
+        ("nan", f"rank {TROUBLED} of {{world}} stops: ValueError: the inpainter"),
+    ],
+)
+def test_a_rank_that_fails_ends_the_others_and_is_named(tmp_path, world, case, message):
+    codes, outputs = launch(tmp_path, world, case, 1)
+    assert all(code != 0 for code in codes)
+    assert message.format(world=world) in outputs[TROUBLED]
+    assert not any("stops: ValueError" in output for rank, output in enumerate(outputs) if rank != TROUBLED)
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_a_shard_that_is_cut_on_one_rank_is_noticed_before_the_first_step(tmp_path, world):
+    codes, outputs = launch(tmp_path, world, "cut shard", 1)
+    assert codes == [1] * world
+    assert all(f"ValueError: rank {TROUBLED} differs from rank 0: its manifest is" in output for output in outputs)
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_a_killed_rank_ends_the_others(tmp_path, world):
+    codes, _ = launch(tmp_path, world, "killed", 1)
+    assert codes[TROUBLED] == -signal.SIGKILL and all(code != 0 for code in codes)
+
+
+@pytest.mark.slow
+def test_the_launcher_names_a_killed_rank(tmp_path):
+    tar = photo_tar(tmp_path / "photos.tar", 4)
+    script = tmp_path / "script.py"
+    script.write_text(
+        f"import os, sys\nsys.path.insert(0, {str(Path(__file__).resolve().parents[1])!r})\nfrom tests.test_ranks import train\n"
+        f"if __name__ == '__main__':\n    train(int(os.environ['RANK']), 2, {str(tmp_path / 'store')!r}, {tar!r}, 'killed', 1)\n"
+    )
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2", str(script)]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_SECONDS)
+    assert run.returncode != 0 and "Signal 9 (SIGKILL)" in run.stderr
+    assert f"rank      : {TROUBLED}" in run.stderr
