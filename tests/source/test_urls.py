@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from zsdata.source.urls import base_name, expand_urls, local_path
+from zsdata.source.urls import base_name, expand_urls, local_path, shown_url, without_secrets
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def test_file_urls_are_local(folder):
 
 @pytest.mark.parametrize("url", ["pipe:cat x.tar", "{pipe:curl x,a.tar}", Path("pipe:cat x.tar")])
 def test_pipe_urls_are_refused_by_name(url):
-    with pytest.raises(ValueError, match="pipe: urls run shell commands"):
+    with pytest.raises(ValueError, match=r"pipe: urls run shell commands.* always refused; name the tar itself"):
         expand_urls(url)
 
 
@@ -64,6 +64,10 @@ def test_pipe_urls_are_refused_by_name(url):
         ("simplecache::http://host/a.tar", ValueError, '"::" is not supported'),
         ("nonsense://host/a.tar", ValueError, "fsspec"),
         ("http://host/*.tar", ValueError, "globs find local shards only"),
+        ("http:///a.tar", ValueError, "'http:///a.tar' has no host"),
+        ("https://host:99999/a.tar?token=1", ValueError, "'https://host:99999/a.tar' has no host, or no port that exists"),
+        ("http://[::1/a.tar", ValueError, "has no host"),
+        ("http://a..b/a.tar", ValueError, "has no host"),
         ("s-{00..11.tar", ValueError, "unbalanced braces"),
         ("", ValueError, "empty"),
         ([], ValueError, "at least one tar"),
@@ -97,6 +101,33 @@ def test_a_shard_named_twice_is_an_error(folder):
     for twice in (f"{folder}/./s-03.tar", f"file://{folder}/s-03.tar"):
         with pytest.raises(ValueError, match=r"s-03.tar is named twice"):
             expand_urls([folder, twice])
+
+
+def test_an_address_of_numbers_is_no_chain_of_file_systems():
+    assert expand_urls("http://[::1]:8000/a.tar") == ["http://[::1]:8000/a.tar"]
+
+
+@pytest.mark.parametrize(
+    ("url", "shown"),
+    [
+        ("https://user:pw@host:8080/a/b.tar?X-Amz-Signature=secret&x=/y@z#part", "https://host:8080/a/b.tar"),
+        ("http://host?token=a@b", "http://host"),
+        ("ftp://user:p@w@host/b.tar", "ftp://host/b.tar"),
+        ("s3://bucket/what?.tar", "s3://bucket/what?.tar"),
+        ("hf://datasets/a/b@main/c.tar", "hf://datasets/a/b@main/c.tar"),
+        ("/local/user@host/a?b.tar", "/local/user@host/a?b.tar"),
+    ],
+)
+def test_a_shown_url_has_no_secrets(url, shown):
+    assert shown_url(url) == shown
+    assert without_secrets(f"cannot open '{url}' (or {url})") == f"cannot open '{shown}' (or {shown})"
+
+
+def test_a_message_about_an_address_has_no_secrets():
+    for urls in (["https://h/a.tar?token=secret"] * 2, "https://u:secret@h/*.tar?a=secret"):
+        with pytest.raises(ValueError, match=r"https://h/") as caught:
+            expand_urls(urls)
+        assert "secret" not in str(caught.value)
 
 
 def test_the_name_of_a_shard_has_no_folder_and_no_token():

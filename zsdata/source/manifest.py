@@ -63,11 +63,16 @@ class Manifest:
 
     def member(self, index: int) -> Member:
         """Photo `index`, 0 <= index < len(self)."""
+        number, key, offset, size = self._place(index)
+        return Member(shown_url(self.shard_urls[number]), key, offset, size)
+
+    def _place(self, index: int) -> tuple[int, str, int, int]:
+        """Shard, key, offset and size of photo `index`."""
         if not 0 <= index < len(self):
             raise IndexError(f"photo {index} of a source with {len(self):,}")
         start = int(self.key_ends[index - 1]) if index else 0
         key = self.key_text[start : int(self.key_ends[index])].decode("utf-8", "surrogateescape")
-        return Member(shown_url(self.shard_urls[self.shard_numbers[index]]), key, int(self.offsets[index]), int(self.sizes[index]))
+        return int(self.shard_numbers[index]), key, int(self.offsets[index]), int(self.sizes[index])
 
     def read(self, index: int, cache: ShardCache | None = None) -> bytes:
         """The bytes of photo `index`, read by range.
@@ -80,8 +85,7 @@ class Manifest:
             BadPhoto: they are not those that were indexed.
             OSError: the shard cannot be read; UnreachableShard for a remote one.
         """
-        shown, key, offset, size = self.member(index)
-        number = self.shard_numbers[index]
+        number, key, offset, size = self._place(index)
         url = self.shard_urls[number]
         checksum = CHECKSUM_UNKNOWN if self.checksums is None else int(self.checksums[index])
         stamp = None if self.stamps is None else self.stamps[number]
@@ -89,7 +93,7 @@ class Manifest:
             stamp = None  # a file may be touched; its bytes say more
         data = read_range(url, offset, size, inside=f'"{key}"', stamp=stamp, cache=cache)
         if checksum == CHECKSUM_UNKNOWN:
-            fault = header_inside(shown, key, offset, data)
+            fault = header_inside(shown_url(url), key, offset, data)
             if fault is not None:
                 raise fault
         elif zlib.crc32(data) != checksum:

@@ -131,6 +131,8 @@ def read_patiently(url: str, offset: int, size: int, fetch: Fetch, stamp: Stamp 
 
 def check_unchanged(url: str, offset: int, listed: Stamp, now: Stamp) -> None:
     """Raises ChangedShard where something that both stamps know is another."""
+    if listed == now:
+        return
     different = [name for name in listed if name in now and listed[name] != now[name]]
     if different:
         changes = ", ".join(f"{name} {_value(listed[name])} then, {_value(now[name])} now" for name in different)
