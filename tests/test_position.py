@@ -72,5 +72,5 @@ def test_ranks_that_stand_elsewhere_are_named():
     require_one_place([STATE] * 3)
     with pytest.raises(ValueError, match="rank 2 differs from rank 0: its samples is 48, not 40: they stand at different places"):
         require_one_place([STATE, STATE, {**STATE, "samples": 48}])
-    with pytest.raises(ValueError, match="rank 1 differs from rank 0: its manifest is 'c', not 'a+': the photos, their order"):
+    with pytest.raises(ValueError, match=r"rank 1 differs from rank 0: its manifest is 'c', not 'a+': the photos, their order"):
         require_one_place([STATE, {**STATE, "manifest": "c"}])

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import traceback
 from contextlib import redirect_stderr, redirect_stdout
 from datetime import timedelta
 from pathlib import Path
@@ -76,7 +77,11 @@ def run_rank(rank, log, *arguments):
         os.dup2(file.fileno(), 2)
         with redirect_stdout(file), redirect_stderr(file):
             logging.basicConfig(force=True)
-            train(rank, *arguments)
+            try:
+                train(rank, *arguments)
+            except Exception:
+                traceback.print_exc()
+                raise SystemExit(1) from None
 
 
 def launch(folder, world, case, workers):
