@@ -40,7 +40,7 @@ class DiffusionInpainter:
 
     Attributes:
         network, device: as given.
-        dtype, scheduler: what was chosen: the networks' torch.dtype, the scheduler's class name.
+        steps, dtype, scheduler: what was chosen: denoising steps, the networks' torch.dtype, the scheduler's class name.
         micro_batch: how many samples go through the U-Net at once (`.size`), and how often that had to be lowered (`.lowered`).
 
     Raises:
@@ -49,7 +49,7 @@ class DiffusionInpainter:
     """
 
     def __init__(self, network: DiffusionNetwork, device: str | torch.device = "cpu") -> None:
-        self.network = network
+        self.network, self.steps = network, network.steps
         self.device = torch.device(device)
         self.dtype = choose_dtype(network.dtype, self.device)
         parts = load_diffusion_parts(network.name, network.subfolder, network.revision, network.autoencoder, self.dtype)
