@@ -11,6 +11,7 @@ from torch.utils.data import DataLoader
 
 from tests.scenes import grey_fill, jpeg, layered_depth, photo, photo_tar, png, write_tar
 from zsdata import AdaptiveDisparity, AugmentConfig, ImageSource, StereoBatch, UniformDisparity, ZeroStereoStream
+from zsdata.quality import QualityGate
 from zsdata.synthesis.view import ViewConfig
 
 SIZE = (64, 96)
@@ -221,9 +222,24 @@ def test_odd_photos_give_a_right_pair_or_are_counted(tmp_path, depth):
         for tensor in (pair.left, pair.right, pair.disparity, pair.confidence, pair.right_clean):
             assert torch.isfinite(tensor).all()
         assert pair.disparity.min() > 0 and pair.confidence.min() >= 0 and pair.confidence.max() <= 1
-    assert {"constant", "small", "grey", "cmyk", "turned", "deep", "palette", "wide"} <= seen
-    assert {example[2] for example in stream.stats()["examples"]} == {"thin", "tiny"}
-    assert sum(stream.stats()["rejected"].values()) >= 2
+    assert seen == {"constant", "small", "grey", "cmyk", "turned", "deep", "palette"}
+    assert {example[2] for example in stream.stats()["examples"]} == {"thin", "tiny", "wide"}
+    everything = QualityGate(max_hole_share=1, min_visible_share=0, min_disparity_range_px=0, min_flip_consistency=0)
+    assert {pair.meta["key"] for pair in open_stream(tar, depth=depth, quality=everything)} == {*seen, "wide"}
+
+
+@pytest.mark.parametrize("placement", ["worker", "device"])
+@pytest.mark.parametrize("workers", [0, 2])
+def test_pairs_that_teach_nothing_are_counted_and_replaced_by_the_same_ones_everywhere(tar, placement, workers):
+    gate = QualityGate(max_hole_share=0.16)
+    options = {"depth": CountingDepth(), "quality": gate, "views_per_image": 2}
+    plain = list(open_stream(tar, **options))
+    refused = [reject for pair in plain for reject in pair.meta["replaced"]]
+    assert refused and all(reason.startswith("too many holes: ") for *_, reason in refused)
+    assert all(pair.meta["hole_share"] <= 0.16 for pair in plain)
+    with open_stream(tar, depth_placement=placement, **options).loader(3, num_workers=workers) as loader:
+        assert by_index(batch[i] for batch in loader for i in range(3)) == by_index(plain)
+        assert loader.stats()["rejected"] == {"too many holes": len(refused)}
 
 
 def test_the_largest_disparity_is_the_drawn_share_of_the_photos_width(tar):

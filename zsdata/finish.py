@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from zsdata.augment import AugmentConfig, augment
+from zsdata.faults import BadPhoto
 from zsdata.meter import Meter
 from zsdata.prepared import Draft, Drafts, Prepared, make
 from zsdata.sample import Masks, StereoBatch
@@ -21,7 +22,7 @@ from zsdata.seeding import rng
 from zsdata.synthesis.depth import DepthEstimator, as_network
 from zsdata.synthesis.inpaint import Inpainter, fill
 from zsdata.synthesis.synthesizer import INPAINT_CONTEXT_PX, DepthMaps, estimate_depth, predict_depth
-from zsdata.worker import Recipe, naming, single_thread, store_depth
+from zsdata.worker import Recipe, Worker, naming, single_thread, store_depth
 
 
 @dataclass(frozen=True)
@@ -30,21 +31,32 @@ class Synthesis:
 
     depth: DepthEstimator
     recipe: Recipe
+    worker: Worker  # of the same recipe: draws what stands in for a pair that the quality gate refuses
 
     def __call__(self, drafts: Drafts, device: torch.device, meter: Meter) -> Prepared:
         """The pairs of a batch of drafts, on the device; a photo's depth is estimated once, however many views of it are in the batch."""
-        with meter.stage("depth"):
-            known = self._estimate({_photo(draft): draft for draft in drafts.drafts if draft.depth is None}, device)
-        pairs = []
-        for draft in drafts.drafts:
-            depth = draft.depth if draft.depth is not None else known[_photo(draft)]
-            depth = depth._replace(inverse_depth=depth.inverse_depth.to(device), confidence=depth.confidence.to(device))
-            with naming(draft.meta):
-                left = draft.left.to(device, non_blocking=True)
-                pairs.append(make(replace(draft, left=left), depth, self.recipe.inpainter_needs, self.recipe.synthesis, meter))
-        made = Prepared.stack(pairs)
-        meta = [{**made.meta[row], "index": sample["index"]} for row, sample in zip(drafts.rows, drafts.meta, strict=True)]
-        return replace(made, meta=meta, rejected=drafts.rejected, seconds=drafts.seconds, rows=drafts.rows)
+        drawn = list(drafts.drafts)
+        made: dict[int, Prepared] = {}
+        while len(made) < len(drawn):
+            missing = {place: draft for place, draft in enumerate(drawn) if place not in made}
+            with meter.stage("depth"):
+                known = self._estimate({_photo(draft): draft for draft in missing.values() if draft.depth is None}, device)
+            for place, draft in missing.items():
+                depth = draft.depth if draft.depth is not None else known[_photo(draft)]
+                try:
+                    made[place] = self._make(draft, depth, device, meter)
+                except BadPhoto as fault:
+                    drawn[place] = self.worker.instead(draft, fault.reason)
+        pairs = Prepared.stack([made[place] for place in range(len(drawn))])
+        meta = [{**pairs.meta[row], "index": sample["index"]} for row, sample in zip(drafts.rows, drafts.meta, strict=True)]
+        rejected = [reject for draft in drawn for reject in draft.rejected]
+        return replace(pairs, meta=meta, rejected=rejected, seconds=drafts.seconds, rows=drafts.rows)
+
+    def _make(self, draft: Draft, depth: DepthMaps, device: torch.device, meter: Meter) -> Prepared:
+        depth = depth._replace(inverse_depth=depth.inverse_depth.to(device), confidence=depth.confidence.to(device))
+        draft = replace(draft, left=draft.left.to(device, non_blocking=True))
+        with naming(draft.meta):
+            return make(draft, depth, self.recipe.inpainter_needs, self.recipe.synthesis, self.recipe.gate, meter)
 
     @torch.inference_mode()
     def _estimate(self, drafts: dict[tuple[str, str], Draft], device: torch.device) -> dict[tuple[str, str], DepthMaps]:

@@ -6,7 +6,7 @@ import logging
 import multiprocessing
 import os
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -120,6 +120,7 @@ class StereoLoader:
                 with self._meter.stage("wait"):
                     prepared = self._next_prepared()
                 batch = self._finisher(prepared, self._meter)
+                self._count(batch.meta)
                 self._batches += 1
                 self._samples += self._global_batch
                 last = self._left(epoch, self._samples) == 0
@@ -225,11 +226,14 @@ class StereoLoader:
         if [(meta["epoch"], meta["index"]) for meta in prepared.meta] != [(self._epoch, index) for index in expected]:
             raise RuntimeError(f"expected samples {expected} of epoch {self._epoch}, got {prepared.meta}")
         self._meter.add(prepared.seconds)
-        firsts = [meta for meta in prepared.meta if meta["index"] == meta["pair"]]  # samples that reuse a pair refused nothing anew
+        return prepared
+
+    def _count(self, samples: Sequence[Mapping[str, Any]]) -> None:
+        """Counts the photos that the samples (the `meta` of a batch) stand in for; a pair's on its first sample alone."""
+        firsts = [meta for meta in samples if meta["index"] == meta["pair"]]
         if self._rejected is not None:
             self._rejected.add(firsts)
-        self._faults.add(len(prepared.meta), [tuple(reject) for meta in firsts for reject in meta["replaced"]])
-        return prepared
+        self._faults.add(len(samples), [tuple(reject) for meta in firsts for reject in meta["replaced"]])
 
     def _indices(self, samples: int) -> list[int]:
         first = samples + self.rank * self.batch_size

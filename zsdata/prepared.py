@@ -9,7 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from zsdata.faults import BadPhoto
 from zsdata.meter import Meter
+from zsdata.quality import QualityGate
 from zsdata.synthesis.synthesizer import DepthMaps, SynthesisConfig, synthesize
 from zsdata.synthesis.view import View
 
@@ -118,19 +120,33 @@ def stack(samples: Sequence[Any]) -> Prepared | Drafts:
     return type(samples[0]).stack(samples)
 
 
-def make(draft: Draft, depth: DepthMaps, needs: Sequence[str], config: SynthesisConfig, meter: Meter) -> Prepared:
-    """The pair of a draft, on the device of the draft's tensors and `depth`."""
+def make(draft: Draft, depth: DepthMaps, needs: Sequence[str], config: SynthesisConfig, gate: QualityGate, meter: Meter) -> Prepared:
+    """The pair of a draft, on the device of the draft's tensors and `depth`.
+
+    Raises:
+        BadPhoto: where the gate refuses it.
+    """
     made = synthesize(draft.left.unsqueeze(0).float(), depth, draft.view, draft.scale, config, meter)
     width = draft.view.width - draft.view.margin
     context = dict(draft.context)
     if "right_disparity" in needs:
         context["right_disparity"] = made.right_disparity[0].contiguous()
     hole = made.inpaint_mask[..., :width]
+    least, largest = (float(limit) for limit in made.disparity.aminmax())
+    hole_share = float(hole.count_nonzero()) / hole.numel()
+    reason = gate.refuses(
+        hole_share=hole_share,
+        visible_share=float(made.nonocclusion_mask.count_nonzero()) / made.nonocclusion_mask.numel(),
+        disparity_range_px=largest - least,
+        flip_consistency=float(depth.consistency[0]),
+    )
+    if reason is not None:
+        raise BadPhoto(reason)
     meta = {
         **draft.meta,
-        "largest_disparity_px": float(made.disparity.max()),
+        "largest_disparity_px": largest,
         "flip_consistency": round(float(depth.consistency[0]), 6),
-        "hole_share": float(hole.count_nonzero()) / hole.numel(),
+        "hole_share": hole_share,
     }
     return Prepared(
         left=draft.left[..., :width].contiguous(),

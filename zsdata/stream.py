@@ -23,7 +23,9 @@ from zsdata.loader import SAMPLE_TIMEOUT_SECONDS, StereoLoader
 from zsdata.meter import Meter
 from zsdata.position import Position
 from zsdata.prepared import Draft, Prepared, stack
+from zsdata.quality import QualityGate
 from zsdata.sample import StereoBatch
+from zsdata.source.shard_cache import ShardCache
 from zsdata.sources import Schedule
 from zsdata.synthesis.depth import DepthEstimator, DepthNetwork, as_network, load_depth
 from zsdata.synthesis.depth.builtin import warn_once
@@ -39,6 +41,7 @@ logger = logging.getLogger("zsdata")
 
 SMALLEST_CROP_PX = 32
 DEPTH_PLACEMENTS = ("auto", "worker", "device")
+SHARD_CACHE_BYTES = 100_000_000_000
 DEPTH_CACHE_BYTES = 50_000_000_000  # about 50,000 photos of 480x640
 
 
@@ -75,6 +78,9 @@ class ZeroStereoStream(IterableDataset):
         depth_cache: a folder that keeps the depth of every photo, so that a slow estimator is paid once per photo and not once per epoch.
             Any number of workers, ranks and runs may share it.
         depth_cache_bytes: the most that the folder may hold; 3 bytes per pixel of each photo. A full cache keeps what it has.
+        shard_cache: a folder that keeps what was read from shards behind a url; shared as `depth_cache` is.
+        shard_cache_bytes: the most that it may hold.
+        quality: which pairs are refused and replaced: too many holes, flat depth, and the like.
         view, synthesis, augmentation: configurations of these steps; `AugmentConfig.none()` leaves the pairs as they are.
         budget: how many photos may be refused before the run stops.
 
@@ -102,6 +108,9 @@ class ZeroStereoStream(IterableDataset):
         view: ViewConfig | None = None,
         synthesis: SynthesisConfig | None = None,
         augmentation: AugmentConfig | None = None,
+        shard_cache: str | os.PathLike[str] | None = None,
+        shard_cache_bytes: int = SHARD_CACHE_BYTES,
+        quality: QualityGate | None = None,
         budget: FailureBudget | None = None,
     ) -> None:
         super().__init__()
@@ -144,6 +153,8 @@ class ZeroStereoStream(IterableDataset):
             view=view if view is not None else ViewConfig(),
             synthesis=synthesis,
             inpainter_needs=tuple(getattr(inpainter, "needs", ())),
+            gate=quality if quality is not None else QualityGate(),
+            shard_cache=None if shard_cache is None else ShardCache(shard_cache, shard_cache_bytes),
             reuse=reuse,
         )
         if self._recipe.depth == "builtin":
@@ -327,7 +338,10 @@ class ZeroStereoStream(IterableDataset):
 
     def _finisher(self, device: torch.device, micro_batch: int, depth_on_device: bool = False) -> Finisher:
         recipe = self._recipe
-        synthesis = Synthesis(load_depth(recipe.depth, device), recipe) if depth_on_device else None
+        synthesis = None
+        if depth_on_device:
+            recipe = replace(recipe, depth_on_device=True)
+            synthesis = Synthesis(load_depth(recipe.depth, device), recipe, Worker(recipe))
         return Finisher(load_inpainter(self._inpaint, device), self._augmentation, micro_batch, device, synthesis, recipe.reuse)
 
     def _place(self, epoch: int, samples: int) -> Position:
@@ -341,6 +355,7 @@ class ZeroStereoStream(IterableDataset):
             "disparity": [type(recipe.disparity).__name__, asdict(recipe.disparity)],
             "view": asdict(recipe.view),
             "synthesis": asdict(recipe.synthesis),
+            "quality": asdict(recipe.gate),
             "augmentation": asdict(self._augmentation),
         }
         digest = hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest()

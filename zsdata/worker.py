@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,8 +17,10 @@ from zsdata.faults import BadPhoto, BadShard, NoUsablePhoto
 from zsdata.meter import Meter
 from zsdata.plan import Choice
 from zsdata.prepared import Draft, Prepared, Rejected, make
+from zsdata.quality import QualityGate
 from zsdata.seeding import rng
 from zsdata.source.photo import decode_rgb, probe_size
+from zsdata.source.shard_cache import ShardCache
 from zsdata.sources import Schedule, SourceSet
 from zsdata.synthesis.depth import DepthEstimator, DepthNetwork, as_network, load_depth
 from zsdata.synthesis.depth.cache import DepthCache, photo_digest
@@ -45,6 +47,8 @@ class Recipe:
     view: ViewConfig
     synthesis: SynthesisConfig
     inpainter_needs: tuple[str, ...]
+    gate: QualityGate
+    shard_cache: ShardCache | None
     reuse: int  # samples, one after another, that are one pair with augmentations of their own
     depth_on_device: bool = False  # workers hand over drafts, and whoever owns the device makes the pairs
 
@@ -93,21 +97,26 @@ class Worker:
             made = self._last_pair[1]
             return replace(made, meta={**made.meta, "index": index}, rejected=[], seconds={})
         with single_thread():
-            draft = self._draft(sources, epoch, index, pair)
-            made = draft
-            if draft.depth is not None and not self._recipe.depth_on_device:
-                with naming(draft.meta):
-                    meter = Meter()
-                    made = make(draft, draft.depth, self._recipe.inpainter_needs, self._recipe.synthesis, meter)
-                meter.add(draft.seconds)
-                made = replace(made, seconds=meter.seconds)
+            made = self._first_usable(sources, epoch, index, pair)
         if self._recipe.reuse > 1:
             self._last_pair = ((sources, epoch, pair), made)
         return made
 
-    def _draft(self, sources: SourceSet, epoch: int, index: int, pair: int) -> Draft:
-        rejected: list[Rejected] = []
-        choice: Choice | None = sources.plan.choose(epoch, index)
+    def instead(self, draft: Draft, reason: str) -> Draft:
+        """What stands in for a draft whose pair, made elsewhere, was refused for `reason`; raises as `prepare`."""
+        meta = draft.meta
+        refused = (meta["source"], meta["shard"], meta["key"], reason)
+        with single_thread():
+            made = self._first_usable(
+                self._recipe.schedule.at(meta["epoch"]), meta["epoch"], meta["index"], meta["pair"], [*draft.rejected, refused]
+            )
+        assert isinstance(made, Draft)  # pairs are made elsewhere
+        return made
+
+    def _first_usable(self, sources: SourceSet, epoch: int, index: int, pair: int, rejected: Sequence[Rejected] = ()) -> Prepared | Draft:
+        """The sample's first choice, or the first of its spares that is not refused; `rejected` are those that were tried already."""
+        rejected = list(rejected)
+        choice: Choice | None = sources.plan.choose(epoch, index) if not rejected else sources.plan.spare(epoch, index, len(rejected) - 1)
         while choice is not None and len(rejected) <= MOST_SPARES:
             member = sources.manifests[choice.source].member(choice.member)
             meta = {
@@ -121,7 +130,7 @@ class Worker:
             }
             try:
                 with naming(meta):
-                    return self._draft_from(sources, choice, meta, rejected)
+                    return self._make(self._draft(sources, choice, meta, rejected))
             except (BadPhoto, BadShard) as fault:
                 rejected.append((meta["source"], member.shard_url, member.key, fault.reason))
             choice = sources.plan.spare(epoch, index, len(rejected) - 1)
@@ -131,7 +140,15 @@ class Worker:
             f"the last ones: {last}. `zsdata verify` lists what is wrong with its shards."
         )
 
-    def _draft_from(self, sources: SourceSet, choice: Choice, meta: dict[str, Any], rejected: list[Rejected]) -> Draft:
+    def _make(self, draft: Draft) -> Prepared | Draft:
+        recipe, meter = self._recipe, Meter()
+        if draft.depth is None or recipe.depth_on_device:
+            return draft
+        made = make(draft, draft.depth, recipe.inpainter_needs, recipe.synthesis, recipe.gate, meter)
+        meter.add(draft.seconds)
+        return replace(made, seconds=meter.seconds)
+
+    def _draft(self, sources: SourceSet, choice: Choice, meta: dict[str, Any], rejected: list[Rejected]) -> Draft:
         recipe, meter = self._recipe, Meter()
         place = recipe.seed, meta["epoch"], meta["pair"]
         photo = self._open(sources, choice, meter)
@@ -165,7 +182,7 @@ class Worker:
         if depth is None:
             with meter.stage("prepare"):
                 unseen = self._for_the_device(photo)
-        return Draft(unseen, depth, digest, left, view, scale, context, meta, rejected, meter.seconds)
+        return Draft(unseen, depth, digest, left, view, scale, context, meta, list(rejected), meter.seconds)
 
     def _for_the_device(self, photo: _Photo) -> Tensor:
         pixels = _planes(photo.pixels()).unsqueeze(0)
@@ -182,7 +199,7 @@ class Worker:
         if self._last is not None and self._last[0] == key:
             return self._last[1]
         with meter.stage("read"):
-            data = manifest.read(choice.member)
+            data = manifest.read(choice.member, self._recipe.shard_cache)
         with meter.stage("decode"):
             photo = _Photo(data)
         self._last = (key, photo) if sources.plan.samples_per_photo > 1 else None
@@ -218,7 +235,7 @@ class Worker:
             if other == choice.member:
                 continue
             try:
-                pixels = decode_rgb(manifest.read(other))
+                pixels = decode_rgb(manifest.read(other, self._recipe.shard_cache))
                 break
             except (BadPhoto, BadShard):  # counted when its own turn comes
                 continue
