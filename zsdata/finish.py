@@ -58,7 +58,7 @@ class Synthesis:
         with naming(draft.meta):
             return make(draft, depth, self.recipe.inpainter_needs, self.recipe.synthesis, self.recipe.gate, meter)
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def _estimate(self, drafts: dict[tuple[str, str], Draft], device: torch.device) -> dict[tuple[str, str], DepthMaps]:
         """Depth of the photos of these drafts: by a network with two halves all in one go, otherwise one by one."""
         config = self.recipe.synthesis
@@ -86,11 +86,17 @@ class Finisher:
 
     inpainter: Inpainter
     augmentation: AugmentConfig
-    micro_batch: int
+    micro_batch: int | None
     device: torch.device
     synthesis: Synthesis | None = None
     reuse: int = 1
     _last: dict[str, Any] = field(default_factory=dict)  # the pair that was filled last: its next sample may begin the next batch
+
+    @property
+    def micro_batch_lowered(self) -> int:
+        """How often a network had to take fewer samples at once because memory ran out."""
+        networks = [self.inpainter, None if self.synthesis is None else self.synthesis.depth]
+        return sum(getattr(getattr(network, "micro_batch", None), "lowered", 0) for network in networks)
 
     def warm_up(self, size: tuple[int, int]) -> list[Any]:
         """Makes the networks ready for crops of this (height, width), as training has memory and no time then; what each of them says."""

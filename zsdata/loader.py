@@ -166,8 +166,9 @@ class StereoLoader:
 
         `batches`, `pairs`; `ready_batches`: how many prepared batches lay ready when one was asked for, on average; `rejected`: photos
         that this rank refused, by reason; `examples`: (source, shard, key, reason) of the first ones; `shard_problems`: faults of the
-        shards themselves, by reason; `seconds`: time by stage, those of the workers added up over all of them, "wait" being how long the
-        training process stood still for lack of a prepared batch.
+        shards themselves, by reason; `micro_batch_lowered`: how often a network had to take fewer at once because memory ran out;
+        `seconds`: time by stage, those of the workers added up over all of them, "wait" being how long the training process stood still for
+        lack of a prepared batch.
         """
         return {
             "batches": self._batches,
@@ -176,6 +177,7 @@ class StereoLoader:
             "rejected": dict(self._faults.by_reason),
             "examples": list(self._faults.examples),
             "shard_problems": dict(self._problems()),
+            "micro_batch_lowered": self._finisher.micro_batch_lowered,
             "seconds": dict(self._meter.seconds),
         }
 

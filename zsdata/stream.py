@@ -221,7 +221,7 @@ class ZeroStereoStream(IterableDataset):
         device: str | torch.device = "cpu",
         rank: int = 0,
         world_size: int = 1,
-        micro_batch: int = 8,
+        micro_batch: int | None = None,
         multiprocessing_context: str | None = None,
         timeout_seconds: float = SAMPLE_TIMEOUT_SECONDS,
         rejected: str | os.PathLike[str] | None = None,
@@ -233,14 +233,15 @@ class ZeroStereoStream(IterableDataset):
             num_workers: processes on the CPU; 0 makes the pairs in this one.
             device: where the batches are finished and given out.
             rank, world_size: which share of every global batch this process is given.
-            micro_batch: pairs that are inpainted at once; changes memory and speed, never a picture.
+            micro_batch: pairs that are inpainted at once; changes memory and speed, and the pictures by no more than rounding. None: all
+                that have holes, or as many as a diffusion network finds to fit into the device's memory.
             multiprocessing_context: "fork", "forkserver" or "spawn"; None is Python's own choice.
             timeout_seconds: the most that a worker may take over one sample before it counts as hung. One that is killed, ends, is stopped
                 or sleeps is noticed within 10 s; only an endless loop, which looks like work, is given this long.
             rejected: a file that gets a line of JSON for every photo that was refused: source, shard, key, reason, epoch, index. It is
                 appended to, and ranks may share it.
         """
-        if micro_batch < 1:
+        if micro_batch is not None and micro_batch < 1:
             raise ValueError(f"micro_batch is 1 or more; got {micro_batch}")
         if self._recipe.size is None and batch_size != 1:
             raise ValueError(f"whole photos (size=None) differ in size and come one at a time: batch_size is 1; got {batch_size}")
@@ -336,7 +337,7 @@ class ZeroStereoStream(IterableDataset):
             self._cpu_finisher = self._finisher(torch.device("cpu"), micro_batch=1)
         return self._cpu_finisher(stack([prepared]), self._meter)[0]
 
-    def _finisher(self, device: torch.device, micro_batch: int, depth_on_device: bool = False) -> Finisher:
+    def _finisher(self, device: torch.device, micro_batch: int | None, depth_on_device: bool = False) -> Finisher:
         recipe = self._recipe
         synthesis = None
         if depth_on_device:
