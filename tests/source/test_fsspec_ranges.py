@@ -123,6 +123,11 @@ def test_a_read_of_many_pieces_goes_on_where_it_broke_off():
     assert [start for start, _ in Faulty.reads] == [0, 1 << 20, 2 << 20, 2 << 20]
 
 
+def test_a_piece_that_came_short_is_completed_before_the_next_one():
+    Faulty.script += [None, lambda data: data[:-5]]
+    assert read(0, len(DATA)) == DATA
+
+
 LASTING = [
     (FileNotFoundError(2, "The specified key does not exist."), MissingShard, "not found; check the address"),
     (PermissionError("Access Denied"), RefusedShard, "access is refused; check the credentials"),

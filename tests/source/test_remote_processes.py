@@ -79,6 +79,17 @@ def test_children_read_what_the_parent_reads(server, tmp_path, method):
     assert len({request.connection for request in server.requests}) >= 3  # nobody shares one
 
 
+def test_a_connection_has_one_owner(server):
+    url = server.put("s.tar", DATA)
+    read_range(url, 0, 1000)
+    (of_parent,) = {request.connection for request in server.requests}
+    child = multiprocessing.get_context("fork").Process(target=read_range, args=(url, 0, 1000))
+    child.start()
+    child.join(60)
+    read_range(url, 0, 1000)
+    assert [request.connection == of_parent for request in server.requests] == [True, False, True]
+
+
 def test_an_interpreter_ends_at_once_although_a_call_still_hangs(tmp_path):
     script = (
         "import time\nfrom zsdata.source.time_limit import within\n"
