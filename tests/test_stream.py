@@ -224,7 +224,7 @@ def test_odd_photos_give_a_right_pair_or_are_counted(tmp_path, depth):
         assert pair.disparity.min() > 0 and pair.confidence.min() >= 0 and pair.confidence.max() <= 1
     assert seen == {"constant", "small", "grey", "cmyk", "turned", "deep", "palette"}
     assert {example[2] for example in stream.stats()["examples"]} == {"thin", "tiny", "wide"}
-    everything = QualityGate(max_hole_share=1, min_visible_share=0, min_disparity_range_px=0, min_flip_consistency=0)
+    everything = QualityGate(max_hole_share=1, min_visible_share=0, min_depth_range=0, min_flip_consistency=0)
     assert {pair.meta["key"] for pair in open_stream(tar, depth=depth, quality=everything)} == {*seen, "wide"}
 
 

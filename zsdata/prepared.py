@@ -138,6 +138,7 @@ def make(draft: Draft, depth: DepthMaps, needs: Sequence[str], config: Synthesis
         hole_share=hole_share,
         visible_share=float(made.nonocclusion_mask.count_nonzero()) / made.nonocclusion_mask.numel(),
         disparity_range_px=largest - least,
+        drawn_px=draft.scale * depth.inverse_depth.shape[-1] * draft.view.scale_x,
         flip_consistency=float(depth.consistency[0]),
     )
     if reason is not None:
