@@ -208,6 +208,13 @@ def parts_of(most: int) -> Act:
     return act
 
 
+def elsewhere(handler: Handler, file: File) -> None:
+    """As many bytes as asked for, from 7 bytes further on."""
+    first, stop = handler.asked(len(file.data) - 7)
+    handler.begin(file, first + 7, stop + 7)
+    handler.wfile.write(file.data[first + 7 : stop + 7])
+
+
 def hang_up_after(handler: Handler, file: File) -> None:
     """A good answer, after which the server closes the connection without having said that it would."""
     serve(handler, file)
