@@ -4,7 +4,8 @@ python benchmarks/matchers.py                                     small sizes on
 python benchmarks/matchers.py --device cuda --json matchers.json  the paper's: batch 8, 384x512, 22 iterations in training, 32 in inference
 python benchmarks/matchers.py --models raft --ways bf16           parts of the table
 
-Every way starts from the same weights and sees the same pairs, in one process; float32 is eager, with TF32 off, and the measure of the others.
+Every way starts from the same weights and sees the same pairs, in one process; float32 is eager, with TF32 off, and what the others are
+measured by. To compile takes minutes on the CPU, and is done there only for --ways that say so.
 A training step is forward, ZeroStereo loss, backward, clipping and AdamW. Medians after a warm-up, on the CPU of the process's own
 time, which others on the machine do not change. The peak is that of tensors on a GPU, and of the whole process on the CPU. The last column
 is how far the last prediction is from float32's, averaged over the pixels, as a share of the largest disparity; where that is more
@@ -59,7 +60,6 @@ WAYS = {
     "bf16+compile+channels_last": Way(half=torch.bfloat16, compiled=True, channels_last=True),
     "tf32+compile": Way(tf32=True, compiled=True),
 }
-ONLY_ON_CUDA = ("tf32", "tf32+compile")
 DEVIATIONS = {"float32": 1e-4, "tf32": 1e-2, "bf16": 5e-2}  # allowed, by the first word of the way
 
 
@@ -206,7 +206,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu", help='"cpu" or "cuda"; sets the defaults of what follows (default: cpu)')
     parser.add_argument("--models", nargs="+", choices=list(MODELS), default=list(MODELS))
-    parser.add_argument("--ways", nargs="+", choices=list(WAYS), help="besides float32 (default: all that the device has)")
+    parser.add_argument(
+        "--ways", nargs="+", choices=list(WAYS), help="besides float32 (default: all, on the CPU none with tf32 or compile)"
+    )
     for name in Sizes.__dataclass_fields__:
         default = ", ".join(f"{device}: {getattr(sizes, name)}" for device, sizes in DEFAULTS.items())
         parser.add_argument(f"--{name.replace('_', '-')}", type=int, metavar="N", help=f"default: {default}")
@@ -218,8 +220,8 @@ def main() -> None:
     defaults = DEFAULTS[device.type]
     given = {name: getattr(arguments, name) for name in Sizes.__dataclass_fields__}
     sizes = Sizes(**{name: getattr(defaults, name) if value is None else value for name, value in given.items()})
-    ways = [way for way in arguments.ways or WAYS if device.type == "cuda" or way not in ONLY_ON_CUDA]
-    ways = ["float32", *[way for way in ways if way != "float32"]]
+    usual = [name for name, way in WAYS.items() if device.type == "cuda" or not (way.tf32 or way.compiled)]
+    ways = ["float32", *[way for way in arguments.ways or usual if way != "float32"]]
 
     report: dict[str, Any] = {"machine": machine(device), "sizes": vars(sizes), "rows": []}
     print(json.dumps(report["machine"]))

@@ -316,19 +316,15 @@ def test_a_tracker_that_is_not_installed_is_an_error(tar, tmp_path, monkeypatch)
         run_training(tar, tmp_path / "run", config(steps=1), tracker="wandb")
 
 
-def launch(arguments, processes, script="trainers/raft.py", **variables):
-    command = [
-        str(Path(sys.executable).with_name("accelerate")),
-        "launch",
-        "--cpu",
-        "--num_processes",
-        str(processes),
-        "--num_machines",
-        "1",
-    ]
-    command += ["--mixed_precision", "no", "--dynamo_backend", "no"]
+ACCELERATE = [Path(sys.executable).with_name("accelerate"), "launch", "--cpu", "--num_machines", "1", "--mixed_precision", "no"]
+ACCELERATE += ["--dynamo_backend", "no", "--num_processes"]
+TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node"]
+
+
+def launch(arguments, processes, script="trainers/raft.py", launcher=ACCELERATE, **variables):
+    command = [*launcher, processes, script, *arguments]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", **variables}
-    return subprocess.run([*command, script, *map(str, arguments)], cwd=ROOT, capture_output=True, text=True, env=environment, timeout=240)
+    return subprocess.run([*map(str, command)], cwd=ROOT, capture_output=True, text=True, env=environment, timeout=240)
 
 
 def arguments_for(tar, output, *more):
@@ -371,9 +367,8 @@ def test_two_ranks_train_as_one_with_twice_the_batch_and_one_goes_on_where_two_s
 def test_a_nan_on_one_rank_skips_the_step_on_both(tar, tmp_path):
     output = tmp_path / "run"
     options = ("--steps", 3, "--save-every", 1)
-    done = launch(
-        arguments_for(tar, output, *options), 2, script="tests/trainers/record_samples.py", NAN_AT_RANK="1", NAN_AT_STEPS="1"
-    )  # fmt: skip
+    script = "tests/trainers/record_samples.py"
+    done = launch(arguments_for(tar, output, *options), 2, script, TORCHRUN, NAN_AT_RANK="1", NAN_AT_STEPS="1")
     assert done.returncode == 0, done.stderr[-3000:]
     assert [line["skipped_steps"] for line in read_lines(output / "log.jsonl")] == [0, 1, 1]
     (line,) = read_lines(output / "skipped.jsonl")
@@ -428,7 +423,8 @@ def parsed(*arguments):
     return parser.parse_args([str(argument) for argument in ("--output", "run", *arguments)])
 
 
-def test_the_switches_of_the_papers_ablations_reach_the_stream(tar):
+def test_the_switches_of_the_papers_ablations_reach_the_stream(tmp_path):
+    tar = photo_tar(tmp_path / "wide.tar", 3, height=300, width=800)
     stream = open_stream(parsed("--sources", tar, "--size", 64, 96, "--disparity", "uniform", "--inpaint", "none", "--no-confidence"))
     pair = stream.replay(0, 1)
     hole = pair.masks.inpaint
