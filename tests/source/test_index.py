@@ -78,7 +78,7 @@ def broken(text):
         changed.pop("sha256")
         return json.dumps({**changed, "sha256": index._digest(changed)}).encode()
 
-    yield from (b"", text[: len(text) // 2], b"null", b"[]", b"{}", b"[" * 100_000, b"\xff\xfe", text.replace(b'"a"', b'"b"'))
+    yield from (b"", text[: len(text) // 2], b"null", b"[]", b"{}", b"[" * 100_000, b"\xff\xfe", text.replace(b'"a"', b'"z"'))
     yield from (signed(zsdata_index=2), signed(shard="b.tar"), signed(keys=["a"]), signed(keys=["a", "a"]), signed(keys=["a", 5]))
     yield from (signed(offsets=[512, 512]), signed(offsets=[-512, 1536]), signed(offsets=[512, 1e9]), signed(offsets=[512, 10**30]))
     yield from (

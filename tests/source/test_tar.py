@@ -249,6 +249,11 @@ def test_headers_of_other_writers_are_read(header):
     assert walk(header + BODY + END) == [("a.jpg", b"12345")]
 
 
+def test_a_block_whose_sum_fits_is_no_header_with_something_else_in_the_place_of_the_magic():
+    with pytest.raises(BadShard, match="not a tar"):
+        walk(raw_header(magic=b"other") + BODY + END)
+
+
 def test_a_signed_checksum_is_accepted():
     name = "é.jpg".encode()
     assert walk(raw_header(name, signed=True) + BODY + END) == [("é.jpg", b"12345")]
