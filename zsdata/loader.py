@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import torch
 from accelerate.state import GradientState
+from torch import Tensor
 
 from zsdata.faults import FailureBudget, FaultLog
 from zsdata.finish import Finisher
@@ -265,7 +266,6 @@ class _Pipeline:
     ) -> None:
         self.revision = revision
         self._pool: WorkerPool | None = None
-        self._pin = device.type == "cuda"
         if num_workers:
             self._pool = WorkerPool(
                 Job(_start_worker, worker.prepare, stack),
@@ -274,14 +274,14 @@ class _Pipeline:
                 ahead=PREFETCHED_BATCHES,
                 context=context,
                 timeout_seconds=timeout_seconds,
+                take=Tensor.pin_memory if device.type == "cuda" else Tensor.clone,
             )
             self._batches: Iterator[Any] = self._pool
         else:
             self._batches = (stack([worker.prepare(*sample) for sample in request]) for request in requests)
 
     def __next__(self) -> Any:
-        prepared = next(self._batches)
-        return prepared.pin_memory() if self._pin else prepared
+        return next(self._batches)
 
     @property
     def ready(self) -> int:

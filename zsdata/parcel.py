@@ -1,6 +1,7 @@
-"""A parcel: what one process made, handed to another in a single piece of memory that has no name.
+"""Parcels: what one process made, handed to another through memory that has no name.
 
-Nothing stands in /dev/shm: its size does not matter, and nothing is left behind however a process ends.
+Nothing stands in /dev/shm: its size does not matter, and nothing is left behind however a process ends. The memory is used again and again,
+since getting it from the system and giving it back takes longer than filling it.
 """
 
 from __future__ import annotations
@@ -14,14 +15,90 @@ import socket
 import struct
 import termios
 from array import array
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
 ALIGNMENT_BYTES = 64  # a cache line; every dtype may begin there
-_MESSAGE = struct.Struct("<QQ")  # bytes of the whole parcel, and of the pickle at its end
+GROWTH_BYTES = 2**20  # memory grows by whole steps, so that it soon grows no more
+_MESSAGE = struct.Struct("<QQQ")  # which memory, bytes of the parcel in it, bytes of the pickle at the parcel's end
 _CLOSE_ON_EXEC = 1
+
+
+class Outbox:
+    """Sends parcels over a SOCK_SEQPACKET socket. A message arrives whole or not at all, whatever happens to the sender.
+
+    Args:
+        ahead: how many parcels may be on their way or waiting: so many memories are used in turn.
+    """
+
+    def __init__(self, channel: socket.socket, ahead: int) -> None:
+        self._channel = channel
+        self._files = [memory_file() for _ in range(ahead)]
+        self._sizes = [0] * ahead
+        self._sent = 0
+
+    def send(self, made: Any) -> None:
+        """Sends anything that can be pickled, its tensors (on the CPU) without pickling them."""
+        head = io.BytesIO()
+        packer = _Packer(head)
+        packer.dump(made)
+        size = packer.size + head.getbuffer().nbytes
+        turn = self._sent % len(self._files)
+        file, grown = self._files[turn], size > self._sizes[turn]
+        if grown:
+            self._sizes[turn] = -(-size // GROWTH_BYTES) * GROWTH_BYTES
+            os.ftruncate(file, self._sizes[turn])
+        for start, tensor in packer.tensors:
+            _write(file, tensor.view(-1).view(torch.uint8).numpy().data, start)
+        _write(file, head.getbuffer(), packer.size)
+        message = _MESSAGE.pack(turn, size, size - packer.size)
+        if grown:
+            socket.send_fds(self._channel, [message], [file])
+        else:
+            self._channel.send(message)
+        self._sent += 1
+
+
+class Inbox:
+    """Receives the parcels of one `Outbox`. Only for channels between processes of one program: it unpickles."""
+
+    def __init__(self, channel: socket.socket) -> None:
+        self._channel = channel
+        self._memories: dict[int, Tensor] = {}
+
+    def receive(self, take: Callable[[Tensor], Tensor]) -> Any:
+        """What `send` was given.
+
+        Args:
+            take: copies a tensor out of the shared memory, which the sender may use again afterwards.
+
+        Raises:
+            EOFError: the other end is closed.
+            OSError: this process has too many open files.
+        """
+        message, files, flags, _ = socket.recv_fds(self._channel, _MESSAGE.size, 1)
+        if not message:
+            raise EOFError
+        turn, size, pickled = _MESSAGE.unpack(message)
+        if flags & socket.MSG_CTRUNC:
+            raise OSError("too many open files: a worker's batch could not be received; raise the limit with `ulimit -n`")
+        for file in files:  # one, when the memory is new or has grown
+            try:
+                # Unlike mmap.mmap, this keeps no file open for as long as the memory is used.
+                self._memories[turn] = torch.from_file(f"/proc/self/fd/{file}", shared=True, size=os.fstat(file).st_size, dtype=torch.uint8)
+            finally:
+                os.close(file)
+        memory = self._memories[turn]
+        return _Unpacker(io.BytesIO(memory[size - pickled : size].numpy().tobytes()), memory, take).load()
+
+    def waiting(self) -> int:
+        """How many parcels have arrived and not been received yet."""
+        waiting_bytes = array("i", [0])
+        fcntl.ioctl(self._channel, termios.FIONREAD, waiting_bytes)
+        return waiting_bytes[0] // _MESSAGE.size
 
 
 class _Packer(pickle.Pickler):
@@ -42,62 +119,14 @@ class _Packer(pickle.Pickler):
 
 
 class _Unpacker(pickle.Unpickler):
-    def __init__(self, file: io.BytesIO, memory: Tensor) -> None:
+    def __init__(self, file: io.BytesIO, memory: Tensor, take: Callable[[Tensor], Tensor]) -> None:
         super().__init__(file)
         self._memory = memory
+        self._take = take
 
     def persistent_load(self, pid: Any) -> Tensor:
         start, end, dtype, shape = pid
-        return self._memory[start:end].view(dtype).view(shape)
-
-
-def send(channel: socket.socket, made: Any) -> None:
-    """Sends anything that can be pickled, its tensors (on the CPU) without pickling them, over a SOCK_SEQPACKET socket.
-
-    The message arrives whole or not at all, whatever happens to the sender.
-    """
-    file = io.BytesIO()
-    packer = _Packer(file)
-    packer.dump(made)
-    memory = memory_file()
-    try:
-        for start, tensor in packer.tensors:
-            _write(memory, tensor.view(-1).view(torch.uint8).numpy(), start)
-        _write(memory, file.getbuffer(), packer.size)
-        pickled = file.getbuffer().nbytes
-        socket.send_fds(channel, [_MESSAGE.pack(packer.size + pickled, pickled)], [memory])
-    finally:
-        os.close(memory)
-
-
-def receive(channel: socket.socket) -> Any:
-    """What `send` was given. Only for channels between processes of one program: it unpickles.
-
-    The tensors lie in the parcel's memory, which is freed with the last of them.
-
-    Raises:
-        EOFError: the other end is closed.
-        OSError: this process has too many open files.
-    """
-    message, files, flags, _ = socket.recv_fds(channel, _MESSAGE.size, 1)
-    if not message:
-        raise EOFError
-    if not files or flags & socket.MSG_CTRUNC:
-        raise OSError("too many open files: a worker's batch could not be received; raise the limit with `ulimit -n`")
-    size, pickled = _MESSAGE.unpack(message)
-    try:
-        # Unlike mmap.mmap, this keeps no file open for as long as the memory is used.
-        memory = torch.from_file(f"/proc/self/fd/{files[0]}", shared=True, size=size, dtype=torch.uint8)
-    finally:
-        os.close(files[0])
-    return _Unpacker(io.BytesIO(memory[size - pickled :].numpy().tobytes()), memory).load()
-
-
-def waiting(channel: socket.socket) -> int:
-    """How many parcels have arrived and not been received yet."""
-    waiting_bytes = array("i", [0])
-    fcntl.ioctl(channel, termios.FIONREAD, waiting_bytes)
-    return waiting_bytes[0] // _MESSAGE.size
+        return self._take(self._memory[start:end].view(dtype).view(shape))
 
 
 def memory_file() -> int:
@@ -110,8 +139,8 @@ def memory_file() -> int:
     return descriptor
 
 
-def _write(file: int, data: Any, start: int) -> None:
-    left = memoryview(data).cast("B") if len(data) else memoryview(b"")
+def _write(file: int, data: memoryview, start: int) -> None:
+    left = data.cast("B") if data.nbytes else data
     while left.nbytes:  # one call writes 2 GB at most
         written = os.pwrite(file, left, start)
         left, start = left[written:], start + written

@@ -21,10 +21,12 @@ from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from typing import Any
 
-from zsdata import parcel
+from torch import Tensor
+
 from zsdata.activity import Activity
 from zsdata.faults import WorkerLost
 from zsdata.meter import Meter
+from zsdata.parcel import Inbox, Outbox
 from zsdata.watch import Watch
 
 LOOK_SECONDS = 1.0  # between two looks at the workers, and at the parent process
@@ -55,6 +57,7 @@ class _Member:
     number: int
     process: BaseProcess
     channel: socket.socket
+    inbox: Inbox
     activity: Activity
     asked: deque[Request] = field(default_factory=deque)
 
@@ -70,13 +73,24 @@ class WorkerPool:
         ahead: batches of each process that are ready or in the making.
         context: "fork", "forkserver" or "spawn"; None is Python's own choice.
         timeout_seconds: the most that a process may take over one sample.
+        take: copies the tensors of a batch out of the memory that the processes share.
     """
 
     def __init__(
-        self, job: Job, requests: Iterator[Request], *, processes: int, ahead: int, context: str | None, timeout_seconds: float
+        self,
+        job: Job,
+        requests: Iterator[Request],
+        *,
+        processes: int,
+        ahead: int,
+        context: str | None,
+        timeout_seconds: float,
+        take: Callable[[Tensor], Tensor] = Tensor.clone,
     ) -> None:
         self._requests = requests
         self._timeout_seconds = timeout_seconds
+        self._ahead = ahead
+        self._take = take
         self._taken = 0
         self._members: list[_Member] = []
         self.close = weakref.finalize(self, _end, self._members, os.getpid())
@@ -110,7 +124,7 @@ class WorkerPool:
             raise StopIteration
         self._wait_for(member)
         try:
-            made, error = parcel.receive(member.channel)
+            made, error = member.inbox.receive(self._take)
         except (EOFError, ConnectionError):
             raise self._lost(member) from None
         if error is not None:
@@ -123,7 +137,7 @@ class WorkerPool:
     @property
     def ready(self) -> int:
         """Batches that wait to be taken."""
-        return sum(parcel.waiting(member.channel) for member in self._members)
+        return sum(member.inbox.waiting() for member in self._members)
 
     def _start(self, number: int, job: Job, context: Any) -> _Member:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -132,7 +146,10 @@ class WorkerPool:
         inherited = [member.channel for member in self._members] + [ours] if context.get_start_method() == "fork" else []
         dies_with_thread = threading.current_thread() is threading.main_thread()
         process = context.Process(
-            target=_work, args=(job, theirs, activity, inherited, dies_with_thread), name=f"zsdata worker {number}", daemon=True
+            target=_work,
+            args=(job, theirs, self._ahead, activity, inherited, dies_with_thread),
+            name=f"zsdata worker {number}",
+            daemon=True,
         )
         try:
             process.start()
@@ -142,7 +159,7 @@ class WorkerPool:
             raise
         finally:
             theirs.close()
-        return _Member(number, process, ours, activity)
+        return _Member(number, process, ours, Inbox(ours), activity)
 
     def _ask(self, member: _Member) -> None:
         request = next(self._requests, None)
@@ -170,7 +187,7 @@ class WorkerPool:
             for member in self._members:
                 if member.process.sentinel in ready or member.process.exitcode is not None:
                     raise self._lost(member)
-                at_work = len(member.asked) > parcel.waiting(member.channel)
+                at_work = len(member.asked) > member.inbox.waiting()
                 if at_work and not ready:
                     watch = watches.get(member.number)
                     if watch is None:
@@ -229,7 +246,7 @@ def _end(members: list[_Member], owner: int) -> None:
     members.clear()
 
 
-def _work(job: Job, channel: socket.socket, activity: Activity, inherited: list[socket.socket], dies_with_thread: bool) -> None:
+def _work(job: Job, channel: socket.socket, ahead: int, activity: Activity, inherited: list[socket.socket], dies_with_thread: bool) -> None:
     """What a process does: until the channel is closed or the parent is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the training process, which ends this one
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # and its handlers are not for a forked child
@@ -245,6 +262,7 @@ def _work(job: Job, channel: socket.socket, activity: Activity, inherited: list[
     def gone() -> bool:
         return os.getppid() != parent or any(event & (select.POLLHUP | select.POLLERR) for _, event in poll.poll(0))
 
+    outbox = Outbox(channel, ahead)
     Meter.entered = activity.enter
     job.start()
     while not gone():
@@ -264,7 +282,7 @@ def _work(job: Job, channel: socket.socket, activity: Activity, inherited: list[
         except Exception as error:
             answer = None, _Portable(error)
         try:
-            parcel.send(channel, answer)
+            outbox.send(answer)
         except ConnectionError:
             return
         del answer
