@@ -5,6 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+import zsdata.synthesis.warp as warp_file
 from tests.oracles import cubic, warp_row
 from zsdata.synthesis.warp import forward_warp
 
@@ -116,11 +117,14 @@ def test_masks_and_disparity_equal_the_definitions(disparity):
             assert abs(abs(right_disparity[landing[x]] - row[x]) - 1) < 1e-4
 
 
-def test_a_sample_is_the_same_in_any_batch_and_with_any_number_of_threads():
-    left, disparity = torch.rand(3, 3, 20, 50) * 255, torch.rand(3, 1, 20, 50) * 20
-    together = forward_warp(left, disparity)
+@pytest.mark.parametrize("size", [(20, 50), (300, 500)])
+def test_a_sample_is_the_same_in_any_batch_and_with_any_number_of_threads(size):
+    left, disparity = torch.rand(3, 3, *size) * 255, torch.rand(3, 1, *size) * 20
+    disparity = (disparity + disparity[..., :1]).round_(decimals=1).repeat_interleave(2, dim=3)[..., : size[1]]
     threads = torch.get_num_threads()
     try:
+        torch.set_num_threads(2)
+        together = forward_warp(left, disparity)
         torch.set_num_threads(1)
         for i in range(3):
             alone = forward_warp(left[i : i + 1], disparity[i : i + 1])
@@ -128,6 +132,19 @@ def test_a_sample_is_the_same_in_any_batch_and_with_any_number_of_threads():
                 assert torch.equal(a[0], b[i])
     finally:
         torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize("values", ["one surface", "no two neighbours on one surface"])
+def test_an_image_is_the_same_in_whatever_parts_it_is_warped(values, monkeypatch):
+    left, disparity = torch.rand(2, 3, 7, 30) * 255, torch.rand(2, 1, 7, 30)
+    if values != "one surface":
+        disparity += torch.arange(30) % 2 * 5
+    whole = forward_warp(left, disparity)
+    assert whole.right.amax((1, 2, 3)).le(left.amax((1, 2, 3))).all()
+    for name, pixels in (("CPU_PART_PX", 1), ("CPU_PART_PX", 100)):
+        monkeypatch.setattr(warp_file, name, pixels)
+        for a, b in zip(forward_warp(left, disparity), whole, strict=True):
+            assert torch.equal(a, b)
 
 
 def test_a_value_that_is_no_number_covers_nothing():
@@ -139,10 +156,37 @@ def test_a_value_that_is_no_number_covers_nothing():
     assert not warp.nonocclusion_mask.flatten()[[5, 7]].any()
 
 
-def test_colour_has_a_gradient():
-    left = torch.rand(1, 3, 4, 16, requires_grad=True)
-    forward_warp(left, torch.rand(1, 1, 4, 16) * 4).right.sum().backward()
-    assert left.grad is not None and torch.isfinite(left.grad).all() and left.grad.any()
+@pytest.mark.parametrize("step", [-1.0, 0.5, 1.0, 2.0])
+def test_rows_know_nothing_of_each_other(step):
+    left, disparity = torch.rand(1, 3, 4, 16) * 255, torch.full((1, 1, 4, 16), 3.0)
+    left[..., :2] = torch.tensor([0.0, 255.0])  # one range for all rows
+    disparity += step * torch.arange(4.0).view(-1, 1)
+    whole = forward_warp(left, disparity)
+    for y in range(4):
+        for all_rows, one in zip(whole, forward_warp(left[..., y : y + 1, :], disparity[..., y : y + 1, :]), strict=True):
+            assert torch.equal(all_rows[..., y : y + 1, :], one)
+
+
+def test_results_carry_no_gradient():
+    left, disparity = torch.rand(1, 3, 4, 16, requires_grad=True), (torch.rand(1, 1, 4, 16) * 4).requires_grad_()
+    warp = forward_warp(left, disparity)
+    assert not warp.right.requires_grad and not warp.right_disparity.requires_grad
+
+
+@settings(max_examples=60, deadline=None)
+@given(scenes(st.one_of(dyadic, smooth)), st.data())
+def test_the_first_columns_are_those_of_the_whole_result(disparity, data):
+    columns = data.draw(st.integers(1, disparity.shape[1]))
+    disparity = torch.from_numpy(disparity)[None, None]
+    left = torch.arange(3.0 * disparity.numel()).view(1, 3, *disparity.shape[2:]).sin()
+    for part, whole in zip(forward_warp(left, disparity, columns), forward_warp(left, disparity), strict=True):
+        assert torch.equal(part, whole[..., :columns])
+
+
+@pytest.mark.parametrize("columns", [0, 17])
+def test_columns_that_the_image_does_not_have_are_named(columns):
+    with pytest.raises(ValueError, match=f"1..16, the width of `left`; got {columns}"):
+        forward_warp(torch.zeros(1, 3, 4, 16), torch.zeros(1, 1, 4, 16), columns)
 
 
 def test_shapes_that_do_not_fit_are_named():

@@ -128,18 +128,18 @@ def synthesize(photo_view: Tensor, depth: DepthMaps, view: View, scale: float, c
     with meter.stage("sharpen"):
         disparity = sharpen_disparity(disparity).clamp(min=SMALLEST_DISPARITY_PX)
     with meter.stage("warp"):
-        warped = forward_warp(photo_view, disparity)
+        width = view.width - view.margin
+        warped = forward_warp(photo_view, disparity, columns=min(width + INPAINT_CONTEXT_PX, view.width))
 
-    width = view.width - view.margin
     missing = max(0, INPAINT_CONTEXT_PX - view.margin)  # the photo ends there: nothing is known of it
     return Synthesized(
         left=photo_view[..., :width],
         disparity=disparity[..., :width],
         confidence=confidence[..., :width],
         nonocclusion_mask=warped.nonocclusion_mask[..., :width],
-        right=F.pad(warped.right[..., : width + INPAINT_CONTEXT_PX], (0, missing)),
-        inpaint_mask=F.pad(warped.inpaint_mask[..., : width + INPAINT_CONTEXT_PX], (0, missing), value=True),
-        right_disparity=F.pad(warped.right_disparity[..., : width + INPAINT_CONTEXT_PX], (0, missing)),
+        right=F.pad(warped.right, (0, missing)) if missing else warped.right,
+        inpaint_mask=F.pad(warped.inpaint_mask, (0, missing), value=True) if missing else warped.inpaint_mask,
+        right_disparity=F.pad(warped.right_disparity, (0, missing)) if missing else warped.right_disparity,
     )
 
 

@@ -10,8 +10,8 @@ d = x - u; so the z-buffer is `amax` of the source's position. And with d = n + 
 first column at or right of x' is x - n, so that every comparison is between disparities, never between rounded positions.
 
 Fast, because nearly every pixel, with its right neighbour, covers just the first column at or right of x'. What that column would show is
-computed for every left pixel, without a look-up; then each right pixel takes it from its winner. The few that are covered otherwise, at the
-ends of surfaces and where they stretch, are done again as a list.
+computed for every left pixel, without a look-up; then each right pixel takes it from its winner. The few that are covered otherwise, where
+surfaces begin and where they are stretched, are computed as a list.
 """
 
 from __future__ import annotations
@@ -20,22 +20,23 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from zsdata.synthesis.indices import flat_indices
 
-CACHED_PX = 65_536  # warped at once on the CPU: what is between the steps stays in its cache
+CPU_PART_PX = 262_144  # warped at once on the CPU: what is between the steps stays in its cache
+PART_PX = 2**28  # elsewhere; pixels are numbered by int32
+BYTES_PER_PX = 64  # of what is between the steps
 # Of the cubic that resamples colours. At 1/2 it is Catmull-Rom's; at 1 a shift by half a pixel leaves the right view as sharp as the left
 # (0.92 of its gradient energy against 0.72), so that blur does not tell the fraction of a disparity. See benchmarks/reprojection.py.
 SHARPNESS = 1.0
 LARGEST_STEP_PX = 1.0  # neighbours whose disparities differ by more are two surfaces
-SMALLEST_STRETCH = 1e-6  # px of the right view that a left pixel is stretched to; less is hidden by its neighbour
-FAR_AWAY_PX = 1e9  # the disparity of a hole where it is compared with a pixel's own
+TIE_PX = 2.0**-26  # less than the distance of any other fraction of a disparity from 1/2
+OUTSIDE_PX = 1e9  # the disparity of what lies outside of the image, where it is compared with a pixel's own
 
 
 class Warped(NamedTuple):
-    """What `forward_warp` returns; H and W are those of the left image.
+    """What `forward_warp` returns; H is that of the left image, and so is W unless fewer columns are asked for.
 
     Attributes:
         right: [B, C, H, W], dtype of `left`: the right view, 0 in its holes.
@@ -50,235 +51,328 @@ class Warped(NamedTuple):
     right_disparity: Tensor
 
 
-def forward_warp(left: Tensor, disparity: Tensor) -> Warped:
+@torch.no_grad()
+def forward_warp(left: Tensor, disparity: Tensor, columns: int | None = None) -> Warped:
     """Moves each pixel of `left` by its disparity; the nearest one wins (paper, section "Overview": the warped image and both masks).
 
     Colours are resampled along the row by a cubic (see SHARPNESS) at the point of the surface that lands on the pixel's centre, with taps
-    from that surface alone, so that nothing bleeds across a depth edge. Every pixel of the result depends on its own row only,
-    and no sum depends on the batch: a sample's result is the same bit for bit in any batch. Differentiable in `left`; not in `disparity`.
+    from that surface alone, so that nothing bleeds across a depth edge. Every pixel of the result depends on its own row only, and no sum
+    depends on the batch: a sample's result is the same bit for bit in any batch. Not differentiable: the results carry no gradient.
 
     Args:
         left: float [B, C, H, W]; RGB 0..255 in the stream, any C and range here (the result is kept within the range of each image).
         disparity: float [B, 1, H, W], pixels, left frame, >= 0. Zero leaves the photo as it is. A non-finite value covers nothing.
+        columns: of the results, counted from the left; None for all W. What lies beyond them in `left` may land in them.
 
     Raises:
-        ValueError: for shapes that do not fit each other, and for a negative disparity.
+        ValueError: for shapes that do not fit each other, for a negative disparity, and for columns that `left` does not have.
     """
     if left.ndim != 4 or disparity.ndim != 4 or 0 in left.shape or disparity.shape != (left.shape[0], 1, *left.shape[2:]):
         raise ValueError(
             f"it takes left [B, C, H, W] and disparity [B, 1, H, W] of one size, got {list(left.shape)} and {list(disparity.shape)}"
         )
-    batch, _, height, width = left.shape
-    disparity, largest = _within_reach(disparity.detach().float(), width)
-    limits = [[float(limit) for limit in image.detach().aminmax()] for image in left]  # cubic convolution overshoots
+    batch, channels, height, width = left.shape
+    columns = width if columns is None else columns
+    if not 1 <= columns <= width:
+        raise ValueError(f"columns is in 1..{width}, the width of `left`; got {columns}")
+    disparity, largest = _within_reach(disparity.float(), width)
+    flat = left.flatten(1)
+    limits = torch.stack((flat.amin(1), flat.amax(1)), 1).tolist()  # the cubic overshoots
 
-    rows = height if left.device.type != "cpu" else min(height, max(1, CACHED_PX // (batch * width)))
-    grid = _Grid.make(batch * rows, width, margin=int(largest) + 2, device=left.device)
-    right = torch.empty_like(left)
-    hole, seen = (torch.empty(disparity.shape, dtype=torch.bool, device=left.device) for _ in range(2))
-    right_disparity = torch.empty_like(disparity)
-    for top in range(0, height, rows):
-        band = slice(top, top + rows)
-        shape = disparity[:, 0, band].shape
-        surface = _surface(disparity[:, 0, band])
-        shown = _shown(surface, grid)
-        covered = shown.covered.to(left.dtype)
-        for channel, colour in enumerate(_colours(left[:, :, band], surface, shown)):
-            for image, limit in enumerate(limits):
-                colour.view(shape)[image].clamp_(*limit)
-            right[:, channel, band] = colour.mul_(covered).view(shape)
-        right_disparity[:, 0, band] = shown.disparity.view(shape)
-        hole[:, 0, band] = (1 - shown.covered).bool().view(shape)
-        seen[:, 0, band] = _wins_where_it_lands(surface, shown, grid).view(shape)
-    return Warped(right, hole, seen, right_disparity)
+    part_px, images_at_once = (CPU_PART_PX, 1) if left.device.type == "cpu" else (PART_PX, max(1, min(batch, PART_PX // (height * width))))
+    parts_of_image = -(-height * width // part_px)
+    rows_at_once = -(-height // parts_of_image)
+    grid = _Grid.make(images_at_once * rows_at_once, width, columns, reach=int(largest) + 2, device=left.device)
+    memory = _Memory(BYTES_PER_PX * len(grid.cell), left.device)
+    right = left.new_empty(channels, batch, height, columns)
+    right_disparity = disparity.new_empty(batch, height, columns)
+    hole, seen = (torch.empty_like(right_disparity, dtype=torch.bool) for _ in range(2))
+    for first in range(0, batch, images_at_once):
+        for top in range(0, height, rows_at_once):
+            images, rows = part = slice(first, first + images_at_once), slice(top, top + rows_at_once)
+            out = Warped(
+                right[:, images, rows].flatten(1), hole[part].flatten(0, 1), seen[part].flatten(0, 1), right_disparity[part].flatten()
+            )
+            memory.used = 0
+            _warp_part(left.transpose(0, 1)[:, images, rows].flatten(1), disparity[:, 0][part].flatten(), limits[images], grid, memory, out)
+    return Warped(right.transpose(0, 1).contiguous(), hole.unsqueeze(1), seen.unsqueeze(1), right_disparity.unsqueeze(1))
+
+
+class _Memory:
+    """One block for all that is between the steps, used again for each part: fresh memory costs more than the arithmetic on it."""
+
+    def __init__(self, size: int, device: torch.device) -> None:
+        self._block = torch.empty(size, dtype=torch.uint8, device=device)
+        self.used = 0  # bytes; set it back to give back what was taken since
+
+    def take(self, count: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        """[count], with anything in it."""
+        start = -(-self.used // 64) * 64
+        end = start + count * dtype.itemsize
+        if end > len(self._block):  # images in float64, or hardly two neighbours on one surface
+            return torch.empty(count, dtype=dtype, device=self._block.device)
+        self.used = end
+        return self._block[start:end].view(dtype)
 
 
 def _within_reach(disparity: Tensor, width: int) -> tuple[Tensor, float]:
     """The disparity with all that lands outside of the frame on its left just there, and the largest value."""
-    if not disparity.numel():
-        return disparity, 0.0
     outside = width + 2.0
-    least, largest = (float(limit) for limit in disparity.aminmax())
+    least, largest = float(disparity.amin()), float(disparity.amax())
     if not (least >= 0 and largest <= outside):
         disparity = disparity.nan_to_num(outside, outside, outside).clamp(max=outside)
-        least, largest = (float(limit) for limit in disparity.aminmax())
+        least, largest = float(disparity.amin()), float(disparity.amax())
         if least < 0:
             raise ValueError(f"disparity is positive: left (x, y) is right (x - d, y); got {least:g} px")
     return disparity, largest
 
 
 class _Grid(NamedTuple):
-    """Numbers of a band's pixels, row by row; int32 [N].
+    """Numbers of a part's N pixels, row by row, and of the cells that they land on.
+
+    A row has `stride` cells: `margin` that lie left of the image, those of the wanted columns, and one more if it takes one to make the
+    stride even: a cell's number is odd where its column is. What lands right of the wanted columns falls into the next row's margin.
 
     Attributes:
-        column: of each pixel.
-        place: of each pixel, from 0 on.
-        target: its own column, in rows that have `margin` columns more on the left, where what leaves the frame lands.
+        place: int32 [N], 1 to N.
+        cell: int32 [N], the cell of the pixel's own column.
     """
 
     width: int
+    columns: int
     margin: int
-    column: Tensor
+    stride: int
     place: Tensor
-    target: Tensor
+    cell: Tensor
 
     @staticmethod
-    def make(rows: int, width: int, margin: int, device: torch.device) -> _Grid:
-        column = torch.arange(width, device=device, dtype=torch.int32).repeat(rows)
-        place = torch.arange(rows * width, device=device, dtype=torch.int32)
-        target = torch.arange(rows * (margin + width), device=device, dtype=torch.int32).view(rows, -1)[:, margin:].reshape(-1)
-        return _Grid(width, margin, column, place, target)
+    def make(rows: int, width: int, columns: int, reach: int, device: torch.device) -> _Grid:
+        margin = max(reach, width - columns)
+        margin += margin % 2
+        stride = margin + columns + columns % 2
+        row, column = (torch.arange(count, dtype=torch.int32, device=device) for count in (rows, width))
+        place = (row * width).unsqueeze(1) + (column + 1)
+        cell = (row * stride).unsqueeze(1) + (column + margin)
+        return _Grid(width, columns, margin, stride, place.flatten(), cell.flatten())
+
+    def first(self, count: int) -> _Grid:
+        """The grid of the first `count` pixels."""
+        return self if count == len(self.place) else self._replace(place=self.place[:count], cell=self.cell[:count])
+
+    @property
+    def cells(self) -> int:
+        """How many there are."""
+        return len(self.place) // self.width * self.stride + self.margin
+
+    def wanted(self, cells: Tensor) -> Tensor:
+        """Those of the wanted columns, [rows, columns]."""
+        return cells[: -self.margin].view(-1, self.stride)[:, self.margin : self.margin + self.columns]
 
 
-class _Surface(NamedTuple):
-    """The surfaces that a band's pixels lie on. Flat [N], row by row.
+def _warp_part(planes: Tensor, disparity: Tensor, limits: list[list[float]], grid: _Grid, memory: _Memory, out: Warped) -> None:
+    """Warps whole rows.
+
+    Args:
+        planes: [C, N], of one image or, where there is more than one limit, of as many.
+        disparity: [N].
+        limits: least and largest value of each image.
+        out: what is filled in: right [C, M], masks [rows, columns], right_disparity [M], for M = rows * columns.
+    """
+    count = len(disparity)
+    grid = grid.first(count)
+    surfaces = _surfaces(disparity, grid, memory)
+    special = _special(disparity, surfaces, grid)
+    nearest = grid.wanted(surfaces.nearest)
+    out.inpaint_mask.copy_(nearest).logical_not_()
+    source = memory.take(nearest.numel(), torch.int64)
+    source.view_as(nearest).copy_(nearest)
+    used = memory.used
+
+    shown = memory.take(1 + count + len(special.share))  # as in `_colours`
+    shown[0] = 0
+    torch.lerp(disparity, surfaces.following, surfaces.share, out=shown[1 : 1 + count])
+    shown[1 + count :] = special.disparity
+    torch.index_select(shown, 0, source, out=out.right_disparity)
+    memory.used = used
+    for colours, right in zip(_colours(planes, surfaces, special, limits, memory), out.right, strict=True):
+        torch.index_select(colours, 0, source, out=right)
+    memory.used = used
+    out.nonocclusion_mask.copy_(_wins_where_it_lands(disparity, surfaces.landing, out.right_disparity, grid, memory))
+
+
+class _Surfaces(NamedTuple):
+    """The surfaces that N pixels lie on, and where they land.
 
     Attributes:
-        disparity: float32, px.
-        following: float32, px, the right neighbour's disparity; the last column's is anything.
-        whole: float32, the disparity rounded down: x - whole is the first column at or right of x'.
-        torn: int64, indices of the pixels whose right neighbour lies on another surface; the last column's always does.
-        share: float32, how far from the pixel (0) to its right neighbour (1) the point lies that lands on column x - whole.
+        following: float32 [N], px, the right neighbour's disparity; 0 in the last column.
+        joined: float32 [N + 2], 1 where the pixel and its left neighbour are of one surface, else 0; 0 at N and N + 1.
+        share: float32 [N], how far from the pixel (0) to its right neighbour (1) the point lies that lands on the first column at or right
+            of x'; 0 where they are two surfaces.
+        landing: int32 [N], the cell of round(x'), half to even.
+        nearest: int32, all cells: the z-buffer, the place of the winning pixel, 0 where nothing lands.
+        breaks: int64, ascending, from 0 to N: pixels whose left neighbour lies on another surface, or so far off that the column before
+            the pixel's first at or right of x' is not the neighbour's.
     """
 
-    disparity: Tensor
     following: Tensor
-    whole: Tensor
-    torn: Tensor
+    joined: Tensor
     share: Tensor
+    landing: Tensor
+    nearest: Tensor
+    breaks: Tensor
 
 
-def _surface(band: Tensor) -> _Surface:
-    padded = F.pad(band.reshape(-1), (0, 1))
-    disparity, following = padded[:-1], padded[1:]
-    torn = (following - disparity).abs_() > LARGEST_STEP_PX
-    torn.view(-1, band.shape[-1])[:, -1] = True
-    torn = flat_indices(torn)
-    whole = disparity.floor()
-    share = _share_at(disparity - whole, disparity, following)
-    share[torn] = 0
-    return _Surface(disparity, following, whole, torn, share)
+def _surfaces(disparity: Tensor, grid: _Grid, memory: _Memory) -> _Surfaces:
+    count = len(disparity)
+    following, share, joined = memory.take(count), memory.take(count), memory.take(count + 2)
+    landing, nearest = memory.take(count, torch.int32), memory.take(grid.cells, torch.int32)
+    used = memory.used
+    following[:-1] = disparity[1:]
+    following.view(-1, grid.width)[:, -1] = 0
+    drop = torch.sub(disparity, following, out=share)
+    joined[0] = joined[-1] = 0
+    same = torch.abs(drop, out=joined[1:-1]).le_(LARGEST_STEP_PX)  # 1 or 0: comparisons of floats in place are the fastest
+    same.view(-1, grid.width)[:, -1] = 0
+
+    # A pixel covers the first column at or right of x' unless its neighbour on the same surface lands at or left of that column, too. The
+    # right end of a surface, which reaches half a pixel far, is left to `_special`.
+    whole = torch.floor(disparity, out=memory.take(count))
+    rise = torch.floor(following, out=memory.take(count)).sub_(whole).mul_(same)
+    covers = torch.clamp(rise, -1, 0, out=memory.take(count)).add_(same)
+    simple = memory.take(count + 1, torch.bool)
+    simple[0] = False
+    simple[1:] = covers
+    torch.sub(same, rise.clamp_(min=0), out=covers)
+    place = memory.take(count, torch.int32).copy_(covers).mul_(grid.place)
+    cell = torch.sub(grid.cell, landing.copy_(whole), out=landing)
+    nearest.zero_().scatter_reduce_(0, memory.take(count, torch.int64).copy_(cell), place, "amax")
+
+    fraction = torch.sub(disparity, whole, out=whole)
+    torch.div(fraction, drop.add_(1), out=share).mul_(same).clamp_(max=1)  # x'(i + 1) - x'(i) = 1 + drop
+    odd = torch.bitwise_and(cell, 1, out=place)
+    landing.sub_(place.copy_(fraction.sub_(0.5).add_(odd, alpha=TIE_PX).ceil_()))
+    breaks = flat_indices(simple.logical_not_())
+    memory.used = used
+    return _Surfaces(following, joined, share, landing, nearest, breaks)
 
 
-def _share_at(distance: Tensor, disparity: Tensor, following: Tensor) -> Tensor:
-    """How far from the pixel to its right neighbour the point lies that lands `distance` px right of x'; 0 if that is negative."""
-    stretch = (disparity - following).add_(1).clamp_(min=SMALLEST_STRETCH)  # x'(i + 1) - x'(i)
-    return (distance / stretch).clamp_(0, 1)
-
-
-class _Shown(NamedTuple):
-    """What each right pixel shows. Flat [N].
+class _Special(NamedTuple):
+    """Right pixels that show no pixel's first column at or right of its x'; [S]. The k-th is number N + 1 + k in the z-buffer.
 
     Attributes:
-        source: int64, index of the left pixel whose point it is, or which that point lies right of; anything in holes.
-        covered: float32, 0 in holes, 1 elsewhere.
-        disparity: float32, px; 0 in holes.
-        special: int64, indices of the right pixels that are not at column x - whole of their source.
-        special_share: float32, of these, how far from the source to its right neighbour the point lies.
+        source: int64, the left pixel whose point it shows, or which that point lies right of.
+        share: float32, how far from the source to its right neighbour the point lies.
+        disparity: float32, px.
     """
 
     source: Tensor
-    covered: Tensor
+    share: Tensor
     disparity: Tensor
-    special: Tensor
-    special_share: Tensor
 
 
-def _shown(surface: _Surface, grid: _Grid) -> _Shown:
-    nearest = _nearest(surface, grid)
-    special = flat_indices((nearest & 1).bool())
-    covered = nearest.clamp(max=1).float()
-    place = ((nearest >> 1) - 1).clamp_(min=0)
-    source = place.long()
+def _special(disparity: Tensor, surfaces: _Surfaces, grid: _Grid) -> _Special:
+    """What is seen where surfaces begin, end and are stretched; it enters the z-buffer.
 
-    there = source[special]
-    disparity, following = surface.disparity[there], surface.following[there]
-    distance = (grid.place[special] - place[special]).float() + disparity  # u - x'
-    special_share = _share_at(distance, disparity, following)
-
-    right_disparity = torch.lerp(surface.disparity, surface.following, surface.share).index_select(0, source)
-    right_disparity[special] = torch.lerp(disparity, following, special_share)
-    return _Shown(source, covered, right_disparity.mul_(covered), special, special_share)
-
-
-def _nearest(surface: _Surface, grid: _Grid) -> Tensor:
-    """The z-buffer: int32 [N], right frame: 2 * (place of the winning pixel + 1), + 1 where it is not at its column x - whole; 0 in holes.
-
-    A pixel and its right neighbour on the same surface cover the columns of [x'(i), x'(i + 1)), two at most. At the ends of a surface a
-    pixel covers half a pixel more.
+    The right end of a surface covers its first column at or right of x' where that is half a pixel away at most. The left end covers the
+    column before its own where that is half a pixel away at most, and behind a stretched step the pixel covers it in any case.
     """
-    disparity, following, whole, torn, _ = surface
-    count = len(disparity)
-    rows = count // grid.width
-    column = grid.target[:count] - whole.int()
-    key = (grid.place[:count] + 1) << 1
+    _, joined, _, _, nearest, breaks = surfaces
+    inner = joined.index_select(0, breaks)  # 1 on a stretched step, 0 between two surfaces
+    ends, begins = breaks[1:] - 1, breaks[:-1]
+    pixel = torch.cat((ends, begins))
+    own = disparity.index_select(0, pixel)
+    whole = own.floor()
+    half = (own - whole).sub_(0.5)
+    covers = torch.cat((half[: len(ends)].le_(0).sub_(inner[1:]).clamp_(min=0), torch.maximum(half[len(ends) :].ge_(0), inner[:-1])))
+    cell = grid.cell.index_select(0, pixel).sub_(whole.int()).long()
+    cell[len(ends) :] -= 1
+    place = covers.int().mul_(grid.place.index_select(0, pixel))
+    nearest.scatter_reduce_(0, cell, place, "amax")
 
-    covers = (whole + 1).gt_(following)
-    covers[torn] = (disparity[torn] - whole[torn]).le_(0.5)
-    buffer = torch.zeros(rows * (grid.width + grid.margin), dtype=torch.int32, device=disparity.device)
-    buffer.scatter_reduce_(0, column.long(), key * covers.int(), "amax")
+    cell, place, whole, inner = cell[len(ends) :], place[len(ends) :], whole[len(ends) :], inner[:-1]
+    wins = nearest.index_select(0, cell).eq_(place).mul_(place.clamp_(max=1))
+    number = torch.arange(len(disparity) + 1, len(disparity) + 1 + len(begins), dtype=torch.int32, device=disparity.device)
+    nearest.scatter_reduce_(0, cell, wins.mul_(number), "amax")
 
-    covers_next = following < whole
-    covers_next[torn] = False
-    wide = flat_indices(covers_next)
-    buffer.scatter_reduce_(0, column[wide].long() + 1, key[wide] + 1, "amax")
-
-    first = torch.cat([torn.new_zeros(1), torn[:-1] + 1])  # pixels of the surfaces
-    first = first[disparity[first] - whole[first] >= 0.5]
-    buffer.scatter_reduce_(0, column[first].long() - 1, key[first] + 1, "amax")
-    return buffer.view(rows, -1)[:, grid.margin :].reshape(-1)
+    source = begins - inner.long()
+    here, following = disparity.index_select(0, source), surfaces.following.index_select(0, source)
+    share = (here - whole).div_((here - following).add_(1)).clamp_(0, 1).mul_(inner)
+    return _Special(source, share, torch.lerp(here, following, share))
 
 
-def _colours(left: Tensor, surface: _Surface, shown: _Shown) -> Iterator[Tensor]:
-    """`left` [B, C, rows, W] at the points that are shown; [N] for each channel, anything in holes.
+def _colours(planes: Tensor, surfaces: _Surfaces, special: _Special, limits: list[list[float]], memory: _Memory) -> Iterator[Tensor]:
+    """For each channel a zero for the holes, the colours that the N pixels show, and those of the special ones; [1 + N + S]."""
+    count = planes.shape[1]
+    others = _special_colours(planes, surfaces.joined, special, limits)
+    weights = _Weights(*(memory.take(count) for _ in range(3)))
+    weights = weights.fill(surfaces.share, surfaces.joined[:-2], surfaces.joined[2:]).to(planes.dtype)
+    change = memory.take(count + 2, planes.dtype)  # from the left neighbour; the outermost have no weight
+    change[0] = 0
+    change[-2:] = 0
+    changes = change[:-2], change[1:-1], change[2:]
+    colours = memory.take(1 + count + len(special.share), planes.dtype)
+    colours[0] = 0
+    ordinary = colours[1 : 1 + count]
+    for plane, other in zip(planes, others, strict=True):
+        torch.sub(plane[1:], plane[:-1], out=change[1:-2])
+        weights.cubic(plane, changes, out=ordinary)
+        for image, (least, largest) in zip(ordinary.view(len(limits), -1), limits, strict=True):
+            image.clamp_(least, largest)
+        colours[1 + count :] = other
+        yield colours
 
-    With t the share and p'' the second difference p(i - 1) - 2 p(i) + p(i + 1):
-    lerp(p(i), p(i + 1), t) - SHARPNESS t (1 - t) lerp(p''(i), p''(i + 1), t).
+
+def _special_colours(planes: Tensor, joined: Tensor, special: _Special, limits: list[list[float]]) -> Tensor:
+    """[C, S]."""
+    source, share, _ = special
+    weights = _Weights(*(torch.empty_like(share) for _ in range(3)))
+    weights = weights.fill(share, joined.index_select(0, source), joined.index_select(0, source + 2)).to(planes.dtype)
+    last = planes.shape[1] - 1
+    before, here, following, beyond = (planes.index_select(1, (source + step).clamp_(0, last)) for step in (-1, 0, 1, 2))
+    colours = weights.cubic(here, (here - before, following - here, beyond - following), out=before)
+    if len(limits) == 1:
+        return colours.clamp_(*limits[0])
+    image = torch.div(source, planes.shape[1] // len(limits), rounding_mode="floor")
+    return colours.clamp_(*planes.new_tensor(limits).index_select(0, image).unbind(1))
+
+
+class _Weights(NamedTuple):
+    """The cubic between p(i) and p(i + 1) at a share t, by the changes from p(i - 1) on to p(i + 2).
+
+    With p'' the second difference p(i - 1) - 2 p(i) + p(i + 1): lerp(p(i), p(i + 1), t) - SHARPNESS t (1 - t) lerp(p''(i), p''(i + 1), t).
     Where a surface ends p'' is zero: there its colour goes on straight, and nothing of the other side comes in.
     """
-    inside = left.new_ones(len(shown.source) + 1)
-    inside[0] = 0
-    inside[surface.torn] = 0
-    inside[surface.torn + 1] = 0
-    curve, special_curve = (_Cubic.at(share.to(left.dtype)) for share in (surface.share, shown.special_share))
-    there = shown.source[shown.special]
-    for channel in range(left.shape[1]):
-        padded = F.pad(left[:, channel].reshape(-1), (1, 2))
-        second = (padded[:-2] + padded[2:]).sub_(padded[1:-1], alpha=2).mul_(inside)
-        here, following = padded[1:-2], padded[2:-1]
-        taps = here, following, second[:-1], second[1:]
-        colour = curve(*taps).index_select(0, shown.source)
-        yield colour.index_copy_(0, shown.special, special_curve(*(values.index_select(0, there) for values in taps)))
+
+    before: Tensor
+    between: Tensor
+    after: Tensor
+
+    def fill(self, share: Tensor, joined_before: Tensor, joined_after: Tensor) -> _Weights:
+        """At these shares; `joined_before` is 1 where p(i - 1), `joined_after` where p(i + 2) is of the same surface, else 0."""
+        before, between, after = self
+        torch.addcmul(share, share, share, value=-1, out=before)
+        torch.mul(before, share, out=after)
+        before.sub_(after).mul_(joined_before)
+        after.mul_(joined_after)
+        torch.sub(share, before, alpha=SHARPNESS, out=between).add_(after, alpha=SHARPNESS)
+        return self
+
+    def to(self, dtype: torch.dtype) -> _Weights:
+        return _Weights(*(weight.to(dtype) for weight in self))
+
+    def cubic(self, here: Tensor, changes: tuple[Tensor, Tensor, Tensor], out: Tensor) -> Tensor:
+        """The colour, from p(i) and the three changes."""
+        torch.addcmul(here, self.before, changes[0], value=SHARPNESS, out=out)
+        return out.addcmul_(self.between, changes[1]).addcmul_(self.after, changes[2], value=-SHARPNESS)
 
 
-class _Cubic(NamedTuple):
-    """The cubic of `_colours` at given shares."""
+def _wins_where_it_lands(disparity: Tensor, landing: Tensor, right_disparity: Tensor, grid: _Grid, memory: _Memory) -> Tensor:
+    """[rows, columns], 1 where round(x') lies in the image and the surface seen there is the pixel's own (disparity within 1 px), else 0.
 
-    share: Tensor
-    bend: Tensor
-
-    @staticmethod
-    def at(share: Tensor) -> _Cubic:
-        return _Cubic(share, (share - 1).mul_(share).mul_(SHARPNESS))
-
-    def __call__(self, here: Tensor, following: Tensor, second_here: Tensor, second_following: Tensor) -> Tensor:
-        second = torch.lerp(second_here, second_following, self.share)
-        return torch.lerp(here, following, self.share).addcmul_(self.bend, second)
-
-
-def _wins_where_it_lands(surface: _Surface, shown: _Shown, grid: _Grid) -> Tensor:
-    """bool [N]: True where round(x') lies in the image and the surface seen there is the pixel's own (disparity within 1 px)."""
-    disparity = surface.disparity
-    count = len(disparity)
-    rows = count // grid.width
-    ahead = disparity - 0.5
-    whole = ahead.ceil()
-    steps = whole.int()  # x - steps is the column nearest to x'; of two at one distance the right one,
-    half_way = ahead.eq_(whole).int()
-    steps += half_way & (grid.column[:count] - steps)  # unless it is odd: torch.round takes the even one
-    landing = grid.target[:count] - steps
-
-    seen = torch.full((rows, grid.width + grid.margin), FAR_AWAY_PX, dtype=disparity.dtype, device=disparity.device)
-    seen[:, grid.margin :] = torch.add(shown.disparity, 1 - shown.covered, alpha=FAR_AWAY_PX).view(rows, -1)
-    there = seen.view(-1).index_select(0, landing.long())
-    return (there - disparity).abs_() <= LARGEST_STEP_PX
+    No pixel lands in a hole: its own surface covers the column.
+    """
+    seen = memory.take(grid.cells).fill_(OUTSIDE_PX)
+    wanted = grid.wanted(seen)
+    wanted.copy_(right_disparity.view_as(wanted))
+    there = torch.index_select(seen, 0, memory.take(len(landing), torch.int64).copy_(landing), out=memory.take(len(landing)))
+    return there.sub_(disparity).abs_().le_(LARGEST_STEP_PX).view(-1, grid.width)[:, : grid.columns]
