@@ -47,12 +47,7 @@ def test_safety_costs_less_than_three_percent_of_a_sample(tmp_path, monkeypatch)
 
     def hand_over():
         outbox.send((batch, None))
-        received, _ = inbox.receive(torch.Tensor.clone)
-        touch(received)
-
-    def touch(prepared):
-        for tensor in (prepared.left, prepared.right, prepared.disparity, prepared.confidence, prepared.nonocclusion, prepared.inpaint):
-            tensor.view(torch.uint8).sum() if tensor.dtype == torch.bool else tensor.sum()
+        inbox.receive(torch.Tensor.clone)
 
     def keep_account():
         monkeypatch.setattr(Meter, "entered", activity.enter)
@@ -74,7 +69,7 @@ def test_safety_costs_less_than_three_percent_of_a_sample(tmp_path, monkeypatch)
         loader.state_dict()
 
     per_batch = BATCH * cpu_seconds(make)
-    costs = {"hand over": cpu_seconds(hand_over) - cpu_seconds(lambda: touch(batch)), "keep account": cpu_seconds(keep_account)}
+    costs = {"hand over": cpu_seconds(hand_over), "keep account": cpu_seconds(keep_account)}
     activity.close()
     ours.close()
     theirs.close()
