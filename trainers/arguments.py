@@ -16,8 +16,10 @@ from trainers.scores import METRICS
 from trainers.step_guard import TrainingDiverged
 from trainers.training_loss import LOSSES
 from trainers.validation import EvaluationSet
-from zsdata import AdaptiveDisparity, AugmentConfig, ImageSource, SynthesisConfig, UniformDisparity, ZeroStereoStream
-from zsdata.faults import NoUsablePhoto, TooManyFaults
+from zsdata import AdaptiveDisparity, AugmentConfig, DiffusionNetwork, SynthesisConfig, UniformDisparity, ZeroStereoStream
+from zsdata.faults import NoUsablePhoto, TooManyFaults, WorkerLost
+from zsdata.sources import parse_sources
+from zsdata.stream import DEPTH_PLACEMENTS
 
 
 def add_training_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,6 +57,25 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
         help='"builtin", "background" (another photo, as in MfS-Stereo), "none" (black), or a Hub id or folder in the diffusers format '
         "(default: builtin)",
     )
+    stream.add_argument(
+        "--depth-resolution",
+        metavar="PX",
+        help="short side of a depth network's input in pixels, or \"native\", the photo's own size (default: the network's own)",
+    )
+    stream.add_argument(
+        "--depth-placement",
+        choices=DEPTH_PLACEMENTS,
+        default="auto",
+        help="where depth is estimated: in the workers, on the CPU, or on the training device (default: auto, there where it has a GPU)",
+    )
+    stream.add_argument("--depth-cache", metavar="DIR", help="keep each photo's depth there: it is estimated once, not once per epoch")
+    stream.add_argument("--inpaint-steps", type=int, metavar="T", help="denoising steps of a diffusion network (default: 50)")
+    stream.add_argument("--inpaint-subfolder", metavar="NAME", help='where it lies in --inpaint: "StereoGen" in "Windsrain/ZeroStereo"')
+    stream.add_argument("--views-per-image", type=int, default=1, metavar="K", help="samples in a row from one photo (default: 1)")
+    stream.add_argument(
+        "--reuse", type=int, default=1, metavar="K", help="samples in a row from one pair, with augmentations of their own (default: 1)"
+    )
+    stream.add_argument("--commercial-safe", action="store_true", help="refuse models that are known to be for non-commercial use")
     stream.add_argument(
         "--disparity", choices=("adaptive", "uniform"), default="adaptive", help="the paper's ADS, or MfS-Stereo's uniform range"
     )
@@ -136,22 +157,42 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
 
 def open_stream(arguments: argparse.Namespace) -> ZeroStereoStream:
     """The stream that the arguments describe."""
-    schedule: dict[int, Any] = {0: _sources(arguments.sources)}
+    schedule: dict[int, Any] = {0: parse_sources(arguments.sources)}
     for epoch, *urls in arguments.sources_from:
         if not epoch.isdigit() or not urls:
             raise ValueError(f"--sources-from takes an epoch and urls, such as: --sources-from 5 other.tar; got {' '.join([epoch, *urls])}")
-        schedule[int(epoch)] = _sources(urls)
+        schedule[int(epoch)] = parse_sources(urls)
     return ZeroStereoStream(
         schedule,
         size=tuple(arguments.size),
         depth=arguments.depth,
-        inpaint=leave_black if arguments.inpaint == "none" else arguments.inpaint,
+        depth_resolution=None if arguments.depth_resolution is None else _resolution(arguments.depth_resolution),
+        depth_placement=arguments.depth_placement,
+        depth_cache=arguments.depth_cache,
+        inpaint=_inpainter(arguments),
+        views_per_image=arguments.views_per_image,
+        reuse=arguments.reuse,
+        commercial_safe=arguments.commercial_safe,
         disparity=AdaptiveDisparity() if arguments.disparity == "adaptive" else UniformDisparity(),
         seed=arguments.seed,
         epoch_size=arguments.epoch_size,
         synthesis=SynthesisConfig(flip_confidence=not arguments.no_confidence),
         augmentation=AugmentConfig.none() if arguments.no_augmentation else AugmentConfig(),
     )
+
+
+def _resolution(text: str) -> Any:
+    return int(text) if text.isdecimal() else text
+
+
+def _inpainter(arguments: argparse.Namespace) -> Any:
+    options = {"steps": arguments.inpaint_steps, "subfolder": arguments.inpaint_subfolder}
+    options = {name: value for name, value in options.items() if value is not None}
+    if arguments.inpaint in ("none", "builtin", "background"):
+        if options:
+            raise ValueError(f"--inpaint-{next(iter(options))} belongs to a diffusion network; --inpaint is {arguments.inpaint}")
+        return leave_black if arguments.inpaint == "none" else arguments.inpaint
+    return DiffusionNetwork(arguments.inpaint, **options)
 
 
 def train_config(arguments: argparse.Namespace) -> TrainConfig:
@@ -209,23 +250,7 @@ def run(main: Any) -> None:
     try:
         start_missing_ranks()
         main()
-    except (ValueError, ImportError, OSError, MemoryError, NoUsablePhoto, TooManyFaults, TrainingDiverged) as error:
+    except (ValueError, ImportError, OSError, MemoryError, NoUsablePhoto, TooManyFaults, TrainingDiverged, WorkerLost) as error:
         sys.exit(f"{Path(sys.argv[0]).name}: {error}")
     except KeyboardInterrupt:
         sys.exit(130)
-
-
-def _sources(specs: list[str]) -> Any:
-    if not any("=" in spec.split("://")[0] for spec in specs):
-        return specs
-    sources = {}
-    for spec in specs:
-        name, _, rest = spec.partition("=")
-        urls, weight = rest.rsplit("@", 1) if "@" in rest else (rest, "")
-        if not name or not urls:
-            raise ValueError(f"a named source is NAME=URL or NAME=URL@WEIGHT; got {spec!r}")
-        try:
-            sources[name] = ImageSource(urls, weight=float(weight) if weight else None)
-        except ValueError:
-            raise ValueError(f"the weight in {spec!r} is no number") from None
-    return sources
