@@ -1,6 +1,6 @@
-"""trainers/raft.py, but every rank writes down which samples it trained on; on demand the loss of a rank's batch is NaN.
+"""trainers/raft.py, but every rank writes down which samples it trained on; on demand the loss of some of its batches is broken.
 
-NAN_AT_RANK and NAN_AT_STEPS (comma-separated) in the environment say where and when.
+BROKEN_RANK and BROKEN_BY in the environment say where, and what by: {"number of the batch": factor}.
 """
 
 import json
@@ -10,11 +10,12 @@ from pathlib import Path
 
 import trainers.loop as loop
 import trainers.raft as raft
+import trainers.step_guard as step_guard
 from trainers.training_loss import TrainingLoss
 
 output = Path(sys.argv[sys.argv.index("--output") + 1])
 rank = os.environ.get("RANK", "0")
-broken = os.environ.get("NAN_AT_STEPS", "").split(",") if os.environ.get("NAN_AT_RANK") == rank else []
+broken_by = json.loads(os.environ["BROKEN_BY"]) if os.environ.get("BROKEN_RANK") == rank else {}
 calls = 0
 
 
@@ -25,12 +26,11 @@ class Recording(TrainingLoss):
         with (output / f"samples-{rank}.jsonl").open("a") as file:
             for meta in batch.meta:
                 file.write(json.dumps([meta["epoch"], meta["index"]]) + "\n")
-        if str(calls) in broken:
-            loss = loss * float("nan")
         calls += 1
-        return loss, metrics
+        return loss * broken_by.get(str(calls - 1), 1.0), metrics
 
 
 loop.LOG_EVERY_STEPS = 1
+step_guard.FEWEST_STEPS = 1
 raft.TrainingLoss = Recording
 raft.run(raft.main)

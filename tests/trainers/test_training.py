@@ -364,19 +364,20 @@ def test_two_ranks_train_as_one_with_twice_the_batch_and_one_goes_on_where_two_s
         assert curves[2] == pytest.approx(curves[0][2:], rel=1e-5), name
 
 
-def test_a_nan_on_one_rank_skips_the_step_on_both(tar, tmp_path):
+def test_a_nan_or_an_explosion_on_one_rank_skips_the_step_on_both(tar, tmp_path):
     output = tmp_path / "run"
-    options = ("--steps", 3, "--save-every", 1)
-    script = "tests/trainers/record_samples.py"
-    done = launch(arguments_for(tar, output, *options), 2, script, TORCHRUN, NAN_AT_RANK="1", NAN_AT_STEPS="1")
+    broken = {"BROKEN_RANK": "1", "BROKEN_BY": json.dumps({1: float("nan"), 2: 1e6})}
+    arguments = arguments_for(tar, output, "--steps", 4, "--save-every", 1, "--ema", 0.5)
+    done = launch(arguments, 2, "tests/trainers/record_samples.py", TORCHRUN, **broken)
     assert done.returncode == 0, done.stderr[-3000:]
-    assert [line["skipped_steps"] for line in read_lines(output / "log.jsonl")] == [0, 1, 1]
-    (line,) = read_lines(output / "skipped.jsonl")
-    assert (line["step"], line["rank"]) == (1, 1) and [sample["index"] for sample in line["samples"]] == [3]
-    weights = [load_file(output / "checkpoints" / f"step-0000000{step}" / "model.safetensors") for step in (1, 2, 3)]
+    assert [line["skipped_steps"] for line in read_lines(output / "log.jsonl")] == [0, 1, 2, 2]
+    lines = read_lines(output / "skipped.jsonl")
+    assert [(line["step"], line["rank"]) for line in lines] == [(1, 1), (2, 1)]
+    assert [[sample["index"] for sample in line["samples"]] for line in lines] == [[3], [5]]
+    assert len(read_lines(output / "samples-0.jsonl")) == len(read_lines(output / "samples-1.jsonl")) == 4
+    weights = [run_folder.load(output / "checkpoints" / f"step-0000000{step}")[0]["weights"] for step in (2, 3, 4)]
     assert all(torch.equal(weights[1][name], value) for name, value in weights[0].items())
     assert any(not torch.equal(weights[2][name], value) for name, value in weights[1].items())
-    assert len(read_lines(output / "samples-0.jsonl")) == len(read_lines(output / "samples-1.jsonl")) == 3
 
 
 def test_the_command_trains_evaluates_and_resumes(tar, tmp_path, monkeypatch):
