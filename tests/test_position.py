@@ -6,8 +6,14 @@ from hypothesis import strategies as st
 
 from zsdata.position import Position, require_one_place
 
+EPOCH = 1_000  # samples
 HERE = Position(seed=7, epoch=3, samples=40, manifest="a" * 64, configuration="b" * 64)
 STATE = HERE.to_state()
+
+
+def from_state(state, expected=HERE, epoch_size=EPOCH):
+    return Position.from_state(state, expected, lambda epoch: epoch_size)
+
 
 places = st.builds(
     Position,
@@ -26,40 +32,40 @@ json_values = st.recursive(
 
 @given(places)
 def test_a_state_comes_back_through_json(place):
-    assert Position.from_state(json.loads(json.dumps(place.to_state())), place) == place
+    assert from_state(json.loads(json.dumps(place.to_state())), place, 2**63) == place
 
 
 @given(json_values)
 def test_anything_else_is_refused_as_a_state(value):
     with pytest.raises(ValueError, match="state"):
-        Position.from_state(value, HERE)
+        from_state(value)
 
 
 @given(st.sampled_from(sorted(STATE)), json_values)
 def test_an_edited_field_is_refused_by_name_or_is_a_place(name, value):
     state = {**STATE, name: value}
-    if name in ("epoch", "samples") and type(value) is int and 0 <= value < 2**63:
-        assert getattr(Position.from_state(state, HERE), name) == value
+    if name in ("epoch", "samples") and type(value) is int and 0 <= value < (2**63 if name == "epoch" else EPOCH + 1):
+        assert getattr(from_state(state), name) == value
     elif type(value) is type(STATE[name]) and value == STATE[name]:
-        assert Position.from_state(state, HERE) == HERE
+        assert from_state(state) == HERE
     else:
         with pytest.raises(ValueError, match=f"the state's {name} "):
-            Position.from_state(state, HERE)
+            from_state(state)
 
 
 @given(st.sampled_from(sorted(STATE)), st.text(min_size=1).filter(lambda name: name not in STATE))
 def test_missing_and_unknown_fields_are_named(missing, unknown):
     with pytest.raises(ValueError, match=rf"missing \['{missing}'\]"):
-        Position.from_state({name: value for name, value in STATE.items() if name != missing}, HERE)
+        from_state({name: value for name, value in STATE.items() if name != missing})
     with pytest.raises(ValueError, match="unknown"):
-        Position.from_state({**STATE, unknown: 1}, HERE)
+        from_state({**STATE, unknown: 1})
 
 
 def test_a_refusal_is_short_whatever_the_state_holds():
     long = "x" * 10**6
     for change in ({"version": long}, {"seed": long}, {"manifest": long}, {long: 1}, {"epoch": 10**3000}):
         with pytest.raises(ValueError) as error:
-            Position.from_state({**STATE, **change}, HERE)
+            from_state({**STATE, **change})
         assert len(str(error.value)) < 500
 
 

@@ -154,9 +154,7 @@ class StereoLoader:
         Raises:
             ValueError: for a state of another stream; it names the field that differs.
         """
-        place = Position.from_state(state, self._place())
-        if place.samples > self._epoch_size(place.epoch):
-            raise ValueError(f"the state's samples is {place.samples}, but epoch {place.epoch} has only {self._epoch_size(place.epoch)}")
+        place = Position.from_state(state, self._place(), self._epoch_size)
         self.close()
         self._epoch, self._samples = place.epoch, place.samples
         if not self._left(self._epoch, self._samples):  # a larger batch no longer fits into the rest of the epoch

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -30,8 +30,11 @@ class Position:
         return {"version": VERSION, **asdict(self)}
 
     @staticmethod
-    def from_state(state: Mapping[str, Any], expected: Position) -> Position:
+    def from_state(state: Mapping[str, Any], expected: Position, epoch_size: Callable[[int], int] | None = None) -> Position:
         """The place that `state` names, if it belongs to the stream at `expected`.
+
+        Args:
+            epoch_size: samples of an epoch, where a place in it can be too far.
 
         Raises:
             ValueError: where a field is missing, of the wrong kind, or belongs to another stream; it names the field.
@@ -53,6 +56,8 @@ class Position:
                     f"the state's {name} is {reprlib.repr(state[name])}, this stream's is {getattr(expected, name)!r}: {cause}. "
                     "Open the stream as it was when the state was saved, or start anew without it."
                 )
+        if epoch_size is not None and state["samples"] > epoch_size(state["epoch"]):
+            raise ValueError(f"the state's samples is {state['samples']}, but epoch {state['epoch']} has only {epoch_size(state['epoch'])}")
         return Position(**{name: state[name] for name in names - {"version"}})
 
 

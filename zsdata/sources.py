@@ -74,8 +74,10 @@ class Schedule:
     """
 
     def __init__(self, sources: Any, seed: int, epoch_size: int | None, samples_per_photo: int = 1) -> None:
-        if epoch_size is not None and epoch_size < 1:
-            raise ValueError(f"epoch_size is a number of samples, 1 or more, or None for one exact pass over the photos; got {epoch_size}")
+        if epoch_size is not None and (isinstance(epoch_size, bool) or not isinstance(epoch_size, int) or epoch_size < 1):
+            raise ValueError(
+                f"epoch_size is a number of samples, 1 or more, or None for one exact pass over the photos; got {epoch_size!r}"
+            )
         self._seed = seed
         self._epoch_size = epoch_size
         self._samples_per_photo = samples_per_photo

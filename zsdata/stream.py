@@ -116,7 +116,9 @@ class ZeroStereoStream(IterableDataset):
         super().__init__()
         if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
             raise ValueError(f"seed is an integer >= 0; got {seed!r}")
-        if size is not None and (len(size) != 2 or not all(isinstance(side, int) and side >= SMALLEST_CROP_PX for side in size)):
+        if size is not None and not (
+            isinstance(size, (tuple, list)) and len(size) == 2 and all(isinstance(side, int) and side >= SMALLEST_CROP_PX for side in size)
+        ):
             raise ValueError(f"size is (height, width) in pixels, each {SMALLEST_CROP_PX} or more, or None for whole photos; got {size!r}")
         for name, count in (("views_per_image", views_per_image), ("reuse", reuse)):
             if isinstance(count, bool) or not isinstance(count, int) or count < 1:
@@ -241,8 +243,8 @@ class ZeroStereoStream(IterableDataset):
             rejected: a file that gets a line of JSON for every photo that was refused: source, shard, key, reason, epoch, index. It is
                 appended to, and ranks may share it.
         """
-        if micro_batch is not None and micro_batch < 1:
-            raise ValueError(f"micro_batch is 1 or more; got {micro_batch}")
+        if micro_batch is not None and (isinstance(micro_batch, bool) or not isinstance(micro_batch, int) or micro_batch < 1):
+            raise ValueError(f"micro_batch is an integer, 1 or more; got {micro_batch!r}")
         if self._recipe.size is None and batch_size != 1:
             raise ValueError(f"whole photos (size=None) differ in size and come one at a time: batch_size is 1; got {batch_size}")
         device = torch.device(device)
@@ -280,7 +282,7 @@ class ZeroStereoStream(IterableDataset):
         Raises:
             ValueError: for a state of another stream; it names the field that differs.
         """
-        place = Position.from_state(state, self._place(0, 0))
+        place = Position.from_state(state, self._place(0, 0), self.epoch_size)
         self._epoch, self._samples = place.epoch, place.samples
 
     def stats(self) -> dict[str, Any]:
