@@ -1,4 +1,6 @@
 import json
+import os
+import signal
 import time
 
 import cv2
@@ -11,6 +13,7 @@ from accelerate.state import GradientState
 from tests.scenes import grey_fill, layered_depth, photo_tar
 from tests.test_stream import by_index, open_stream
 from zsdata import StereoBatch
+from zsdata.faults import WorkerLost
 
 
 @pytest.fixture(scope="module")
@@ -149,6 +152,18 @@ def test_an_error_in_a_worker_process_names_the_sample(tar):
 
     with open_stream(tar, depth=broken).loader(2, num_workers=1) as loader, pytest.raises(RuntimeError, match="sample 0 of epoch 0"):
         next(iter(loader))
+
+
+def test_a_killed_worker_is_named_and_the_loader_can_go_on(tar):
+    with open_stream(tar).loader(2, num_workers=2) as loader:
+        batches = iter(loader)
+        seen = [next(batches)]
+        os.kill(loader._pipeline._pool._members[1].process.pid, signal.SIGKILL)
+        with pytest.raises(WorkerLost, match=r"worker 1 of 2 \(process \d+\) was killed by SIGKILL; it was at sample \d+ of epoch 0"):
+            for batch in batches:
+                seen.append(batch)
+        seen += list(loader)
+    assert indices(seen) == [(0, i) for i in range(12)]
 
 
 @pytest.mark.parametrize("context", ["spawn", "forkserver"])

@@ -13,6 +13,7 @@ import socket
 import threading
 import time
 import traceback
+import warnings
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -152,7 +153,10 @@ class WorkerPool:
             daemon=True,
         )
         try:
-            process.start()
+            with warnings.catch_warnings():
+                # Python 3.12 warns of forks beside threads; torch's DataLoader forks so too. OpenCV's threads, which hung, are put to rest.
+                warnings.filterwarnings("ignore", "This process .* is multi-threaded", DeprecationWarning)
+                process.start()
         except BaseException:
             ours.close()
             activity.close()

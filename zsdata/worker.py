@@ -217,7 +217,8 @@ class Worker:
         if self._recipe.depth_on_device:
             return None
         if self._depth is None:
-            self._depth = load_depth(self._recipe.depth)
+            with Meter().stage("load"):  # may wait for a download
+                self._depth = load_depth(self._recipe.depth)
         with torch.inference_mode():
             photo.depth = estimate_depth(self._depth, _planes(photo.pixels()).unsqueeze(0).float(), self._recipe.synthesis)
         if cache is not None:
