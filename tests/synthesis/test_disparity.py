@@ -54,6 +54,24 @@ def test_every_edge_takes_the_nearest_value_that_is_none(disparity):
     assert np.array_equal(sharp, expected)
 
 
+@pytest.mark.parametrize("size", [(30, 7), (7, 60), (24, 24)])
+def test_an_edge_far_from_every_value_finds_the_nearest(size):
+    generator = np.random.default_rng(size[0])
+    disparity = generator.random(size, dtype=np.float32) * 100
+    for y, x in generator.integers((0, 0), (size[0] - 3, size[1] - 3), (3, 2)):
+        disparity[y : y + 3, x : x + 3] = disparity[y, x]
+    edge = sobel_magnitude(torch.from_numpy(disparity)[None, None])[0, 0].numpy() > 3
+    assert 0.9 < edge.mean() < 1
+    sharp = sharpen_disparity(torch.from_numpy(disparity)[None, None])[0, 0].numpy()
+    assert np.array_equal(sharp, nearest_sharp(disparity, edge))
+
+
+def test_a_map_that_is_edge_all_over_stays_as_it_is_beside_one_that_is_not():
+    slope = torch.arange(0.0, 200, 10).expand(1, 1, 12, 20)
+    step = torch.where(torch.arange(20) < 10, 10.0, 40.0).expand(1, 1, 12, 20)
+    assert torch.equal(sharpen_disparity(torch.cat([slope, step, slope])), torch.cat([slope, step, slope]))
+
+
 def test_a_blurred_step_becomes_a_step():
     ramp = torch.tensor([10.0] * 10 + [15, 20, 25, 30, 35] + [40.0] * 10).expand(1, 1, 8, 25).contiguous()
     sharp = sharpen_disparity(ramp)

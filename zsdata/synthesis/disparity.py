@@ -8,10 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from zsdata.synthesis.indices import flat_indices
+from zsdata.synthesis.indices import flat_indices, indices_above
 
 SMALLEST_DISPARITY_PX = 0.01  # of the farthest point; not 0, which marks "no value" in most stereo data sets
 SHARPEN_EDGE_PX = 3.0  # Sobel magnitude above which a disparity belongs to neither side of an edge (the published threshold)
+NEAR_ROWS = 3  # within which nearly every edge value finds one that is none
+NOT_NEAR_PX = 45  # columns off that need no telling apart there; 14 * 45^2 is an int16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +68,7 @@ class UniformDisparity:
         return float(generator.uniform(self.min_px, self.max_px)) / width
 
 
+@torch.no_grad()
 def dilate_disparity(disparity: Tensor, radius_px: int = 1) -> Tensor:
     """Lets near surfaces grow by `radius_px`, so that the rim of an object moves with it (paper, supplement, "Forward Warping").
 
@@ -79,7 +82,7 @@ def dilate_disparity(disparity: Tensor, radius_px: int = 1) -> Tensor:
     for _ in range(radius_px):
         grown = disparity.clone()
         for here, neighbour in _neighbour_slices():
-            grown[here] = torch.maximum(grown[here], disparity[neighbour])
+            torch.maximum(grown[here], disparity[neighbour], out=grown[here])
         disparity = grown
     return disparity
 
@@ -91,6 +94,7 @@ def _neighbour_slices():
         yield (..., whole, first), (..., whole, second)
 
 
+@torch.no_grad()
 def sharpen_disparity(disparity: Tensor, edge_px: float = SHARPEN_EDGE_PX) -> Tensor:
     """Replaces every edge value by the nearest value that is none, so that a depth edge is a step and no pixel hangs between two surfaces.
 
@@ -102,54 +106,103 @@ def sharpen_disparity(disparity: Tensor, edge_px: float = SHARPEN_EDGE_PX) -> Te
         disparity: float32 [B, 1, H, W], pixels.
         edge_px: pixels of disparity.
     """
-    rows, columns = disparity.shape[-2:]
-    edge = flat_indices(sobel_magnitude(disparity) > edge_px)
-    if not len(edge) or len(edge) == disparity.numel():
+    frame = _Frame(disparity)
+    energy = torch.zeros_like(frame.padded)
+    _sobel_energy(frame.padded[..., NEAR_ROWS - 1 : 1 - NEAR_ROWS, :], out=frame.inside(energy))
+    edge = indices_above(energy, 32 * edge_px**2)
+    if edge.shape[0] in (0, disparity.numel()):
         return disparity
+    values = frame.padded.view(-1)
+    values.index_copy_(0, edge, values.index_select(0, _nearest_values(edge, frame)))
+    return frame.inside(frame.padded).contiguous()
 
-    # In each row the nearest value at or left of x, and at or right of x; -1 and `columns` stand for "none".
-    column = torch.arange(columns, device=disparity.device).repeat(disparity.numel() // columns)
-    x = column[edge]
+
+class _Frame:
+    """The maps with a column on each side and NEAR_ROWS rows above and below, so that each edge has its neighbours."""
+
+    def __init__(self, disparity: Tensor) -> None:
+        self.padded = torch.nn.functional.pad(disparity, (1, 1, NEAR_ROWS, NEAR_ROWS), mode="replicate")
+        self.rows, self.columns = self.padded.shape[-2:]
+
+    def inside(self, padded: Tensor) -> Tensor:
+        """Without the frame."""
+        return padded[..., NEAR_ROWS:-NEAR_ROWS, 1:-1]
+
+
+def _nearest_values(edge: Tensor, frame: _Frame) -> Tensor:
+    """Where each edge takes its value from. Places are indices into the flattened, padded maps, int64; those of the edges ascend."""
     begins = torch.ones_like(edge, dtype=torch.bool)  # of a run of edges in one row
-    begins[1:] = (edge[1:] != edge[:-1] + 1) | (x[1:] == 0)
-    run = begins.cumsum(0) - 1
-    at_left, at_right = column, column.clone()
-    at_left[edge] = (x[begins] - 1)[run]
-    at_right[edge] = (x[begins.roll(-1)] + 1)[run]
+    torch.ne(edge[1:] - edge[:-1], 1, out=begins[1:])
+    run = begins.cumsum(0).sub_(1)
+    first = flat_indices(begins)
+    before = edge.index_select(0, first) - 1
+    after = edge.index_select(0, torch.cat((first[1:], first.new_tensor([edge.shape[0]]))) - 1) + 1
 
-    y = torch.div(edge, columns, rounding_mode="floor") % rows
-    unknown = rows**2 + columns**2
-    best = torch.full_like(edge, unknown)  # squared distances
-    found = edge.clone()
-    pending = torch.arange(len(edge), device=edge.device)
+    def columns_off(none: int, dtype: torch.dtype) -> tuple[Tensor, ...]:
+        """How far off the nearest value of its row is, on the left and on the right, for all places: `none` at most, 0 but for edges."""
+        off = torch.full((2, *frame.padded.shape), none, dtype=dtype, device=edge.device)
+        frame.inside(off).zero_()
+        sides = off.view(2, -1).unbind()
+        for side, beyond in zip(sides, (before, after), strict=True):
+            outside = side.index_select(0, beyond)
+            distance = (edge - beyond.index_select(0, run)).abs_().add_(outside.index_select(0, run))
+            side.index_copy_(0, edge, distance.clamp_(max=none).to(dtype))
+        return sides
+
+    # Near rows, all at once. Candidates stand in the order of preference at equal distance: nearer rows, the row above, the left one.
+    row_steps = sorted(range(-NEAR_ROWS, NEAR_ROWS + 1), key=abs)
+    there = (edge + frame.columns * edge.new_tensor(row_steps).unsqueeze(1)).flatten()
+    candidates = torch.stack([side.index_select(0, there) for side in columns_off(NOT_NEAR_PX, torch.int16)]).view(2, len(row_steps), -1)
+    count = 2 * len(row_steps)
+    order = [[count * step**2 + 2 * place + side for place, step in enumerate(row_steps)] for side in (0, 1)]
+    key = candidates.square().mul_(count).add_(candidates.new_tensor(order).unsqueeze(-1)).amin((0, 1)).long()
+    square = torch.div(key, count, rounding_mode="floor")
+    choice = key.sub_(square, alpha=count)
+    tables = [step for step in row_steps for _ in (0, 1)], [-1, 1] * len(row_steps)
+    row_step, side = (edge.new_tensor(table).index_select(0, choice) for table in tables)
+    column_step = (square - row_step * row_step).double().sqrt_().long()
+    found = row_step.mul_(frame.columns).add_(edge).add_(column_step.mul_(side))
+
+    far = flat_indices(square > (NEAR_ROWS + 1) ** 2)
+    if far.shape[0]:
+        none = frame.columns  # farther than any value of the row
+        found[far] = _nearest_values_row_by_row(edge[far], columns_off(none, torch.int64), none, frame)
+    return found
+
+
+def _nearest_values_row_by_row(edge: Tensor, columns_off: tuple[Tensor, ...], none: int, frame: _Frame) -> Tensor:
+    """As `_nearest_values`, for some edges and at any distance; the edge itself where a map is edge all over."""
+    found, distance = edge.clone(), torch.full_like(edge, frame.rows**2 + frame.columns**2)
+    row = torch.div(edge, frame.columns, rounding_mode="floor") % frame.rows
+    pending = torch.arange(edge.shape[0], device=edge.device)
     row_distance = 0
-    while len(pending) and row_distance < rows:
-        here, x_here, y_here = edge[pending], x[pending], y[pending]
-        nearest, source = best[pending], found[pending]
-        for row_step in (-row_distance, row_distance)[: 1 if row_distance == 0 else 2]:
-            inside = (y_here + row_step >= 0) & (y_here + row_step < rows)
-            there = (here + row_step * columns).clamp_(0, disparity.numel() - 1)
-            for at in (at_left, at_right):
-                candidate = at.index_select(0, there)
-                step = candidate - x_here
-                distance = step * step + row_distance**2
-                better = inside & (distance < nearest) & (candidate >= 0) & (candidate < columns)
-                nearest = torch.where(better, distance, nearest)
-                source = torch.where(better, there + step, source)
-        best[pending], found[pending] = nearest, source
+    while pending.shape[0] and row_distance < frame.rows:
+        nearest, source = distance[pending], found[pending]
+        for row_step in (-row_distance, row_distance):
+            inside = (row[pending] + row_step >= 0) & (row[pending] + row_step < frame.rows)
+            there = torch.where(inside, edge[pending] + row_step * frame.columns, 0)  # at place 0 is none
+            for off, side in zip(columns_off, (-1, 1), strict=True):
+                step = off.index_select(0, there)
+                square = step * step + row_distance**2
+                better = (step < none) & (square < nearest)
+                nearest = torch.where(better, square, nearest)
+                source = torch.where(better, there + side * step, source)
+        distance[pending], found[pending] = nearest, source
         row_distance += 1
         pending = pending[nearest > row_distance**2]
-
-    sharp = disparity.flatten().clone()
-    sharp[edge] = sharp[found]
-    return sharp.view_as(disparity)
+    return found
 
 
 def sobel_magnitude(disparity: Tensor) -> Tensor:
     """Root mean square of the horizontal and vertical Sobel derivative, borders replicated; [B, 1, H, W], pixels of disparity."""
     padded = torch.nn.functional.pad(disparity, (1, 1, 1, 1), mode="replicate")
-    down = padded[..., :-2, :] + 2 * padded[..., 1:-1, :] + padded[..., 2:, :]
-    across = padded[..., :-2] + 2 * padded[..., 1:-1] + padded[..., 2:]
-    horizontal = (down[..., 2:] - down[..., :-2]) / 4
-    vertical = (across[..., 2:, :] - across[..., :-2, :]) / 4
-    return ((horizontal**2 + vertical**2) / 2).sqrt()
+    return _sobel_energy(padded, out=torch.empty_like(disparity)).div_(32).sqrt_()
+
+
+def _sobel_energy(padded: Tensor, out: Tensor) -> Tensor:
+    """32 times the square of the Sobel magnitude of maps with a border of one pixel: the sum of both squares before any division."""
+    down = (padded[..., :-2, :] + padded[..., 2:, :]).add_(padded[..., 1:-1, :], alpha=2)
+    across = (padded[..., :-2] + padded[..., 2:]).add_(padded[..., 1:-1], alpha=2)
+    horizontal = down[..., 2:] - down[..., :-2]
+    vertical = across[..., 2:, :] - across[..., :-2, :]
+    return torch.addcmul(horizontal.square_(), vertical, vertical, out=out)

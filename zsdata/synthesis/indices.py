@@ -12,3 +12,10 @@ def flat_indices(mask: Tensor) -> Tensor:
     if mask.device.type == "cpu":
         return torch.from_numpy(np.flatnonzero(mask.numpy()))
     return mask.flatten().nonzero().squeeze(1)
+
+
+def indices_above(values: Tensor, limit: float) -> Tensor:
+    """Indices into the flattened values, int64, ascending, of those that are greater than `limit`."""
+    if values.device.type == "cpu":
+        return torch.from_numpy(np.flatnonzero(values.numpy() > limit))
+    return flat_indices(values > limit)
