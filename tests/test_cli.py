@@ -1,5 +1,6 @@
 """The `zsdata` command: what it prints, what it writes, how it ends."""
 
+import gzip
 import os
 import shlex
 import signal
@@ -183,6 +184,27 @@ def test_verify_lists_every_problem(run, tmp_path):
 def test_verify_of_nothing_is_status_2(run, tmp_path):
     status, out, error = run("verify", tmp_path / "{000..009}.tar")
     assert (status, out) == (2, "") and "000.tar" in in_words(error)
+
+
+def test_index_lists_once_and_says_what_is_wrong(run, tmp_path):
+    shard = photo_tar(tmp_path / "a.tar", count=3)
+    size = f"{os.path.getsize(shard) / 1e6:.1f} MB"
+    assert run("index", shard) == (0, f"3 photos in 1 shard, {size}: 1 index written, 0 up to date\n", "")
+    assert run("index", shard) == (0, f"3 photos in 1 shard, {size}: 0 indexes written, 1 up to date\n", "")
+    assert (tmp_path / "a.tar.index.json").exists()
+    twice = write_tar(tmp_path / "b.tar", {"0.jpg": jpeg(photo(0)), "0.jpeg": jpeg(photo(1))})
+    status, out, _ = run("index", twice)
+    assert status == 1 and '"0": duplicate key' in out and "1 problem" in out
+
+
+def test_decompress_makes_shards(run, tmp_path):
+    photo_tar(tmp_path / "a.tar", count=2)
+    plain = (tmp_path / "a.tar").read_bytes()
+    (tmp_path / "packed.tar.gz").write_bytes(gzip.compress(plain))
+    assert run("decompress", tmp_path / "packed.tar.gz", tmp_path / "shards") == (0, f"{tmp_path / 'shards' / 'packed.tar'}\n", "")
+    assert (tmp_path / "shards" / "packed.tar").read_bytes() == plain
+    status, out, error = run("decompress", tmp_path / "packed.tar.gz", tmp_path / "shards")
+    assert (status, out) == (2, "") and "is there already" in in_words(error)
 
 
 @pytest.mark.usefixtures("cheap")

@@ -28,6 +28,8 @@ from zsdata.faults import BadShard, NoUsablePhoto, TooManyFaults
 from zsdata.preview import contact_sheet
 from zsdata.sample import StereoBatch
 from zsdata.source.archive import Problem
+from zsdata.source.compressed import decompress
+from zsdata.source.index import write_index
 from zsdata.source.pack import PackReport, pack
 from zsdata.source.urls import expand_urls
 from zsdata.source.verify import verify
@@ -127,6 +129,29 @@ def _parser() -> argparse.ArgumentParser:
         example='zsdata verify "shards/{000..099}.tar"',
     )
     command.add_argument("urls", metavar="SHARDS", nargs="+", help=_URLS)
+
+    command = add(
+        _index,
+        "index",
+        "list the photos of a source once, for all runs to come",
+        "Walks all shards, reads every photo once, and stores where each lies and its checksum: SHARD.index.json beside a local shard, in "
+        "the cache ($ZSDATA_CACHE, or zsdata in the user's cache folder) for a remote one. Opening a source of many shards then takes "
+        "moments, and photos that change afterwards are noticed. Indexes that are up to date stay; run it again when a shard has changed.",
+        example='zsdata index "shards/{000..099}.tar"',
+    )
+    command.add_argument("urls", metavar="SHARDS", nargs="+", help=_URLS)
+
+    command = add(
+        _decompress,
+        "decompress",
+        "unpack tar.gz and tar.zst to shards",
+        "Photos are read by their place in a shard, which a compressed file does not allow. Writes NAME.tar into OUTPUT for every "
+        "NAME.tar.gz, NAME.tgz or NAME.tar.zst; the originals stay.",
+        example='zsdata decompress "downloads/*.tar.gz" shards',
+    )
+    command.add_argument("urls", metavar="FILE", nargs="+", help='compressed tars: paths, urls or patterns ("downloads/*.tar.gz")')
+    command.add_argument("output", metavar="OUTPUT", help="folder for the shards; made if missing")
+    _add_overwrite(command)
 
     command = add(
         _preview,
@@ -298,7 +323,8 @@ def _pack_and_tell(make_shards: Callable[..., PackReport], options: argparse.Nam
 
 def _verify(options: argparse.Namespace) -> int:
     report = verify(options.urls, _print_problem, shortest_side_px=SHORTEST_SIDE_PX)
-    good = f"{_several(report.photos, 'good photo')} in {_several(report.shards, 'shard')}, {_megabytes(report.bytes)}"
+    held = f", {report.indexed:,} held against their index" if report.indexed else ""
+    good = f"{_several(report.photos, 'good photo')} in {_several(report.shards, 'shard')}, {_megabytes(report.bytes)}{held}"
     if not report.problems:
         print(f"all is well: {good}")
         return OK
@@ -306,6 +332,23 @@ def _verify(options: argparse.Namespace) -> int:
     by_reason = ", ".join(f"{reason}: {count:,}" for reason, count in reasons.most_common())
     print(f"{_several(len(report.problems), 'problem')} ({_printable(by_reason)}); {good}")
     return FOUND_PROBLEMS
+
+
+def _index(options: argparse.Namespace) -> int:
+    report = write_index(options.urls)
+    for problem in report.problems:
+        _print_problem(problem)
+    photos = f"{_several(report.photos, 'photo')} in {_several(report.shards, 'shard')}, {_megabytes(report.bytes)}"
+    print(f"{photos}: {_several(len(report.files), 'index', 'indexes')} written, {report.unchanged:,} up to date")
+    if report.problems:
+        print(f"{_several(len(report.problems), 'problem')} as above; `zsdata verify` decodes every photo")
+    return FOUND_PROBLEMS if report.problems else OK
+
+
+def _decompress(options: argparse.Namespace) -> int:
+    for shard in decompress(options.urls, options.output, overwrite=options.overwrite):
+        print(_printable(shard))
+    return OK
 
 
 def _print_problem(problem: Problem) -> None:
@@ -491,8 +534,8 @@ def _write_png(path: Path, image: np.ndarray) -> None:
         partial.unlink(missing_ok=True)
 
 
-def _several(count: int, noun: str) -> str:
-    return f"{count:,} {noun}" + ("" if count == 1 else "s")
+def _several(count: int, noun: str, nouns: str = "") -> str:
+    return f"{count:,} {noun if count == 1 else nouns or noun + 's'}"
 
 
 def _megabytes(count: int) -> str:

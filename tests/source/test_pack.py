@@ -11,6 +11,7 @@ import pytest
 import webdataset
 
 from zsdata.source.archive import read_shard
+from zsdata.source.index import write_index
 from zsdata.source.manifest import build_manifest
 from zsdata.source.pack import pack
 from zsdata.source.photo import decode_rgb
@@ -200,3 +201,13 @@ def test_names_that_are_no_text_survive(photos, tmp_path):
         file.write(data)
     ((key, packed),) = contents(pack(photos, tmp_path / "shards"))
     assert os.fsencode(key) == b"\xff\xfe" and packed == data
+
+
+def test_packing_anew_drops_the_indexes_of_what_was_there(tmp_path):
+    folder = tmp_path / "photos"
+    fill(folder, "a.jpg")
+    (shard,) = pack(folder, tmp_path / "shards").shards
+    write_index(shard)
+    assert Path(f"{shard}.index.json").exists()
+    pack(folder, tmp_path / "shards", overwrite=True)
+    assert not Path(f"{shard}.index.json").exists()

@@ -132,3 +132,11 @@ def test_a_message_about_an_address_has_no_secrets():
 
 def test_the_name_of_a_shard_has_no_folder_and_no_token():
     assert base_name("/a/b/c.tar") == base_name("https://h/x/c.tar?token=1#2") == base_name("s3://bucket/c.tar") == "c.tar"
+
+
+@pytest.mark.parametrize(
+    "spec", ["a/{0..99999999}.tar", "a/{000..999}/{00000..99999}.tar", "{-9999999999999999..9}.tar", "{0..99999999..2}.tar"]
+)
+def test_a_range_of_too_many_shards_is_refused_at_once(spec):
+    with pytest.raises(ValueError, match=r"stands for .* shards, more than 1,000,000"):
+        expand_urls(spec)

@@ -20,6 +20,7 @@ from zsdata.source.ranges import ShardFile
 from zsdata.source.retry import Stamp
 from zsdata.source.urls import base_name, expand_urls, local_path, shown_url
 
+INDEX_ENDING = ".index.json"
 VERSION = 1
 MAX_INDEX_BYTES = 1 << 28  # 256 MiB; a photo takes about 50 bytes
 CHECKSUM_UNKNOWN = -1
@@ -163,9 +164,9 @@ def _places(url: str) -> list[str]:
     """Where the index of a shard may be, the first one preferred."""
     path = local_path(url)
     identity = os.path.realpath(path) if path is not None else url.split("?", 1)[0]
-    cached = f"{hashlib.sha256(identity.encode('utf-8', 'surrogateescape')).hexdigest()[:32]}-{base_name(url)}.index.json"
+    cached = f"{hashlib.sha256(identity.encode('utf-8', 'surrogateescape')).hexdigest()[:32]}-{base_name(url)}{INDEX_ENDING}"
     cache = os.environ.get("ZSDATA_CACHE") or os.path.join(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "zsdata")
-    return [*([] if path is None else [f"{path}.index.json"]), os.path.join(cache, "index", cached)]
+    return [*([] if path is None else [f"{path}{INDEX_ENDING}"]), os.path.join(cache, "index", cached)]
 
 
 def _stamp(url: str) -> dict[str, Any]:

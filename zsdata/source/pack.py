@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from zsdata.faults import BadPhoto
 from zsdata.source.archive import MAX_PHOTO_BYTES, OTHER_IMAGE_EXTENSIONS, PHOTO_EXTENSIONS
+from zsdata.source.index import INDEX_ENDING
 from zsdata.source.photo import decode_rgb, photo_extension
 
 _BLOCK = 512
@@ -111,6 +112,8 @@ class _Shards:
         shards = [path.with_suffix("") for path in self._partial]
         for path, shard in zip(self._partial, shards, strict=True):
             os.replace(path, shard)
+        for old in _shards_of(self._target, self._name):  # what was indexed is gone
+            old.with_name(old.name + INDEX_ENDING).unlink(missing_ok=True)
         for old in set(_shards_of(self._target, self._name)) - set(shards):
             old.unlink()
         return shards

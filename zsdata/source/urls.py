@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import math
 import os
 import re
 from collections.abc import Sequence
@@ -10,6 +11,9 @@ from urllib.parse import urlsplit
 
 import fsspec
 from braceexpand import braceexpand
+
+MOST_SHARDS = 1_000_000  # that one pattern may stand for; more is a slip of the range
+_RANGE = re.compile(r"\{(-?\d{1,18})\.\.(-?\d{1,18})(?:\.\.(-?\d{1,18}))?\}")
 
 HTTP = ("http", "https")  # the protocols that are spoken here; fsspec speaks the others
 
@@ -80,6 +84,9 @@ def _expand_one(spec: str) -> list[str]:
         raise ValueError("a url is empty; name a tar, a folder of tars, or a pattern")
     if os.path.exists(spec):
         return _local_shards(spec, spec, spec)
+    numbers = math.prod(1 + abs(int(last) - int(first)) // max(1, abs(int(step or 1))) for first, last, step in _RANGE.findall(spec))
+    if numbers > MOST_SHARDS:
+        raise ValueError(f"{spec!r} stands for {numbers:,} shards, more than {MOST_SHARDS:,}; check the range of the braces")
     try:
         names = list(braceexpand(spec))
     except ValueError as error:
