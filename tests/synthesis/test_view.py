@@ -78,3 +78,13 @@ def test_a_whole_view_changes_nothing():
     image = photo(1, 40, 60)
     view = whole_view((40, 60))
     assert np.array_equal(view_photo(image, view), image) and view.scale_x == 1 and view.margin == 0
+
+
+@pytest.mark.parametrize("size", [(60, 96), (30, 48), (17, 90), (30, 24)])
+@pytest.mark.parametrize("mirror", [False, True])
+def test_maps_are_bilinear_with_pixel_centres_where_torch_has_them(size, mirror):
+    values = torch.randint(0, 65_535, (2, 3, 40, 64), dtype=torch.int32)
+    view = View(mirror=mirror, window=(5, 10, 30, 48), height=size[0], width=size[1], margin=0)
+    window = values[..., 5:35, 6:54].flip(-1) if mirror else values[..., 5:35, 10:58]
+    expected = torch.nn.functional.interpolate(window.double(), size, mode="bilinear", align_corners=False)
+    assert torch.allclose(view_map(values, view).double(), expected, atol=0.5)  # of 65,535: float32 holds the place to 1e-5 px

@@ -122,11 +122,11 @@ def synthesize(photo_view: Tensor, depth: DepthMaps, view: View, scale: float, c
     """
     with meter.stage("disparity"):
         largest_px = scale * depth.inverse_depth.shape[-1] * view.scale_x
-        disparity = view_map(depth.inverse_depth, view, depth.first_row) * (largest_px / NEAREST)
+        disparity = view_map(depth.inverse_depth, view, depth.first_row).mul_(largest_px / NEAREST)
         disparity = dilate_disparity(disparity, config.dilate_px)
-        confidence = view_map(depth.confidence, view, depth.first_row) / CERTAIN
+        confidence = view_map(depth.confidence, view, depth.first_row).div_(CERTAIN)
     with meter.stage("sharpen"):
-        disparity = sharpen_disparity(disparity).clamp(min=SMALLEST_DISPARITY_PX)
+        disparity = sharpen_disparity(disparity).clamp_(min=SMALLEST_DISPARITY_PX)
     with meter.stage("warp"):
         width = view.width - view.margin
         warped = forward_warp(photo_view, disparity, columns=min(width + INPAINT_CONTEXT_PX, view.width))
