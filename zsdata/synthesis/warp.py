@@ -83,7 +83,7 @@ def forward_warp(left: Tensor, disparity: Tensor, columns: int | None = None) ->
     parts_of_image = -(-height * width // part_px)
     rows_at_once = -(-height // parts_of_image)
     grid = _Grid.make(images_at_once * rows_at_once, width, columns, reach=int(largest) + 2, device=left.device)
-    memory = _Memory(BYTES_PER_PX * len(grid.cell), left.device)
+    memory = _Memory(BYTES_PER_PX * grid.count, left.device)
     right = left.new_empty(channels, batch, height, columns)
     right_disparity = disparity.new_empty(batch, height, columns)
     hole, seen = (torch.empty_like(right_disparity, dtype=torch.bool) for _ in range(2))
@@ -102,6 +102,7 @@ class _Memory:
     """One block for all that is between the steps, used again for each part: fresh memory costs more than the arithmetic on it."""
 
     def __init__(self, size: int, device: torch.device) -> None:
+        self._size = size
         self._block = torch.empty(size, dtype=torch.uint8, device=device)
         self.used = 0  # bytes; set it back to give back what was taken since
 
@@ -109,7 +110,7 @@ class _Memory:
         """[count], with anything in it."""
         start = -(-self.used // 64) * 64
         end = start + count * dtype.itemsize
-        if end > len(self._block):  # images in float64, or hardly two neighbours on one surface
+        if end > self._size:  # images in float64, or hardly two neighbours on one surface
             return torch.empty(count, dtype=dtype, device=self._block.device)
         self.used = end
         return self._block[start:end].view(dtype)
@@ -134,10 +135,12 @@ class _Grid(NamedTuple):
     stride even: a cell's number is odd where its column is. What lands right of the wanted columns falls into the next row's margin.
 
     Attributes:
+        count: N.
         place: int32 [N], 1 to N.
         cell: int32 [N], the cell of the pixel's own column.
     """
 
+    count: int
     width: int
     columns: int
     margin: int
@@ -153,16 +156,16 @@ class _Grid(NamedTuple):
         row, column = (torch.arange(count, dtype=torch.int32, device=device) for count in (rows, width))
         place = (row * width).unsqueeze(1) + (column + 1)
         cell = (row * stride).unsqueeze(1) + (column + margin)
-        return _Grid(width, columns, margin, stride, place.flatten(), cell.flatten())
+        return _Grid(rows * width, width, columns, margin, stride, place.flatten(), cell.flatten())
 
     def first(self, count: int) -> _Grid:
         """The grid of the first `count` pixels."""
-        return self if count == len(self.place) else self._replace(place=self.place[:count], cell=self.cell[:count])
+        return self if count == self.count else self._replace(count=count, place=self.place[:count], cell=self.cell[:count])
 
     @property
     def cells(self) -> int:
         """How many there are."""
-        return len(self.place) // self.width * self.stride + self.margin
+        return self.count // self.width * self.stride + self.margin
 
     def wanted(self, cells: Tensor) -> Tensor:
         """Those of the wanted columns, [rows, columns]."""
@@ -178,7 +181,7 @@ def _warp_part(planes: Tensor, disparity: Tensor, limits: list[list[float]], gri
         limits: least and largest value of each image.
         out: what is filled in: right [C, M], masks [rows, columns], right_disparity [M], for M = rows * columns.
     """
-    count = len(disparity)
+    count = disparity.shape[0]
     grid = grid.first(count)
     surfaces = _surfaces(disparity, grid, memory)
     special = _special(disparity, surfaces, grid)
@@ -188,7 +191,7 @@ def _warp_part(planes: Tensor, disparity: Tensor, limits: list[list[float]], gri
     source.view_as(nearest).copy_(nearest)
     used = memory.used
 
-    shown = memory.take(1 + count + len(special.share))  # as in `_colours`
+    shown = memory.take(1 + count + special.share.shape[0])  # as in `_colours`
     shown[0] = 0
     torch.lerp(disparity, surfaces.following, surfaces.share, out=shown[1 : 1 + count])
     shown[1 + count :] = special.disparity
@@ -223,7 +226,7 @@ class _Surfaces(NamedTuple):
 
 
 def _surfaces(disparity: Tensor, grid: _Grid, memory: _Memory) -> _Surfaces:
-    count = len(disparity)
+    count = grid.count
     following, share, joined = memory.take(count), memory.take(count), memory.take(count + 2)
     landing, nearest = memory.take(count, torch.int32), memory.take(grid.cells, torch.int32)
     used = memory.used
@@ -279,19 +282,20 @@ def _special(disparity: Tensor, surfaces: _Surfaces, grid: _Grid) -> _Special:
     _, joined, _, _, nearest, breaks = surfaces
     inner = joined.index_select(0, breaks)  # 1 on a stretched step, 0 between two surfaces
     ends, begins = breaks[1:] - 1, breaks[:-1]
+    count = ends.shape[0]
     pixel = torch.cat((ends, begins))
     own = disparity.index_select(0, pixel)
     whole = own.floor()
     half = (own - whole).sub_(0.5)
-    covers = torch.cat((half[: len(ends)].le_(0).sub_(inner[1:]).clamp_(min=0), torch.maximum(half[len(ends) :].ge_(0), inner[:-1])))
+    covers = torch.cat((half[:count].le_(0).sub_(inner[1:]).clamp_(min=0), torch.maximum(half[count:].ge_(0), inner[:-1])))
     cell = grid.cell.index_select(0, pixel).sub_(whole.int()).long()
-    cell[len(ends) :] -= 1
+    cell[count:] -= 1
     place = covers.int().mul_(grid.place.index_select(0, pixel))
     nearest.scatter_reduce_(0, cell, place, "amax")
 
-    cell, place, whole, inner = cell[len(ends) :], place[len(ends) :], whole[len(ends) :], inner[:-1]
+    cell, place, whole, inner = cell[count:], place[count:], whole[count:], inner[:-1]
     wins = nearest.index_select(0, cell).eq_(place).mul_(place.clamp_(max=1))
-    number = torch.arange(len(disparity) + 1, len(disparity) + 1 + len(begins), dtype=torch.int32, device=disparity.device)
+    number = torch.arange(grid.count + 1, grid.count + 1 + count, dtype=torch.int32, device=disparity.device)
     nearest.scatter_reduce_(0, cell, wins.mul_(number), "amax")
 
     source = begins - inner.long()
@@ -310,7 +314,7 @@ def _colours(planes: Tensor, surfaces: _Surfaces, special: _Special, limits: lis
     change[0] = 0
     change[-2:] = 0
     changes = change[:-2], change[1:-1], change[2:]
-    colours = memory.take(1 + count + len(special.share), planes.dtype)
+    colours = memory.take(1 + count + special.share.shape[0], planes.dtype)
     colours[0] = 0
     ordinary = colours[1 : 1 + count]
     for plane, other in zip(planes, others, strict=True):
@@ -374,5 +378,5 @@ def _wins_where_it_lands(disparity: Tensor, landing: Tensor, right_disparity: Te
     seen = memory.take(grid.cells).fill_(OUTSIDE_PX)
     wanted = grid.wanted(seen)
     wanted.copy_(right_disparity.view_as(wanted))
-    there = torch.index_select(seen, 0, memory.take(len(landing), torch.int64).copy_(landing), out=memory.take(len(landing)))
+    there = torch.index_select(seen, 0, memory.take(grid.count, torch.int64).copy_(landing), out=memory.take(grid.count))
     return there.sub_(disparity).abs_().le_(LARGEST_STEP_PX).view(-1, grid.width)[:, : grid.columns]
