@@ -22,6 +22,7 @@ from trainers.arguments import add_training_arguments, leave_black, open_stream,
 from trainers.evaluate import evaluate
 from trainers.loop import TrainConfig, train
 from trainers.models import load_matcher, load_trained
+from trainers.models.raft_stereo import RAFTStereo
 from trainers.step_guard import MOST_SKIPPED_IN_A_ROW, TrainingDiverged
 from trainers.training_loss import TrainingLoss
 from trainers.validation import EvaluationSet
@@ -279,6 +280,13 @@ def test_mixed_precision_trains_and_judges_as_evaluate_does(tar, tmp_path, pairs
     again = evaluate(partial(matcher.predict, iterations=3), pairs)
     for one, other in zip(scores, again, strict=True):
         assert one["all"]["epe"] == pytest.approx(other["all"]["epe"], rel=1e-4)
+
+
+def test_the_options_for_speed_reach_the_matcher(tar, tmp_path, monkeypatch):
+    compiled = []
+    monkeypatch.setattr(RAFTStereo, "compile_parts", lambda matcher: compiled.append(matcher))
+    matcher = run_training(tar, tmp_path / "run", config(steps=1, compile=True, channels_last=True))
+    assert compiled == [matcher] and matcher.cnet.conv1.weight.is_contiguous(memory_format=torch.channels_last)
 
 
 class Notebook(GeneralTracker):
