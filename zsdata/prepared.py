@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from zsdata.faults import BadPhoto
 from zsdata.meter import Meter
 from zsdata.quality import QualityGate
+from zsdata.synthesis.indices import count_true
 from zsdata.synthesis.synthesizer import DepthMaps, SynthesisConfig, synthesize
 from zsdata.synthesis.view import View
 
@@ -132,11 +134,12 @@ def make(draft: Draft, depth: DepthMaps, needs: Sequence[str], config: Synthesis
     if "right_disparity" in needs:
         context["right_disparity"] = made.right_disparity[0].contiguous()
     hole = made.inpaint_mask[..., :width]
-    least, largest = (float(limit) for limit in made.disparity.aminmax())
-    hole_share = float(hole.count_nonzero()) / hole.numel()
+    disparity, nonocclusion = made.disparity[0].contiguous(), made.nonocclusion_mask[0].contiguous()
+    least, largest = float(disparity.amin()), float(disparity.amax())
+    hole_share = count_true(hole) / hole.numel()
     reason = gate.refuses(
         hole_share=hole_share,
-        visible_share=float(made.nonocclusion_mask.count_nonzero()) / made.nonocclusion_mask.numel(),
+        visible_share=count_true(nonocclusion) / nonocclusion.numel(),
         disparity_range_px=largest - least,
         drawn_px=draft.scale * depth.inverse_depth.shape[-1] * draft.view.scale_x,
         flip_consistency=float(depth.consistency[0]),
@@ -151,16 +154,22 @@ def make(draft: Draft, depth: DepthMaps, needs: Sequence[str], config: Synthesis
     }
     return Prepared(
         left=draft.left[..., :width].contiguous(),
-        right=(made.right[0] + 0.5).int().to(torch.uint8),  # by way of int32: five times as fast
-        disparity=made.disparity[0].contiguous(),
+        right=_to_uint8(made.right[0]),
+        disparity=disparity,
         confidence=made.confidence[0].contiguous(),
-        nonocclusion=made.nonocclusion_mask[0].contiguous(),
+        nonocclusion=nonocclusion,
         inpaint=made.inpaint_mask[0].contiguous(),
         context=context,
         meta=meta,
         rejected=draft.rejected,
         seconds=draft.seconds,
     )
+
+
+def _to_uint8(image: Tensor) -> Tensor:
+    """float32 0..255 to uint8, rounded; the image itself is spent. On the CPU numpy converts, three times as fast as torch."""
+    image.add_(0.5)
+    return torch.from_numpy(image.numpy().astype(np.uint8)) if image.device.type == "cpu" else image.to(torch.uint8)
 
 
 def _distinct(samples: Sequence[Any]) -> tuple[list[Any], list[int]]:
