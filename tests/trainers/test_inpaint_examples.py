@@ -194,10 +194,6 @@ def test_a_photo_is_the_truth_of_what_a_left_view_hides(monkeypatch):
     assert 10 < sum(shares) < 30
 
 
-def photos(tmp_path, count=5, **members):
-    return PhotoSource(build_manifest(photo_tar(tmp_path / "photos.tar", count, height=48, width=64)), layered_depth, AdaptiveDisparity())
-
-
 class Pairs:
     """Three pairs, of which one is broken."""
 
@@ -219,8 +215,11 @@ class Pairs:
 
 
 def test_an_example_is_a_function_of_seed_step_and_index(tmp_path):
-    def make(seed=0, batch_size=4, **more):
-        return Examples({"photos": photos(tmp_path), "pairs": StereoSource(Pairs(**more))}, (32, 48), seed, batch_size)
+    tar = photo_tar(tmp_path / "photos.tar", 5, height=48, width=64)
+
+    def make(seed=0, batch_size=4):
+        photos = PhotoSource(build_manifest(tar), layered_depth, AdaptiveDisparity())
+        return Examples({"photos": photos, "pairs": StereoSource(Pairs())}, (32, 48), seed, batch_size)
 
     one, other = make(), make()
     for request in ((0, 0), (3, 1), (70, 2)):
