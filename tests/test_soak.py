@@ -1,6 +1,5 @@
 """A long run holds no more at its end than after its first minute: memory, files, threads, processes, shared memory."""
 
-import os
 import threading
 
 import numpy as np
@@ -8,6 +7,7 @@ import psutil
 import pytest
 
 from tests.scenes import jpeg, photo, write_tar
+from tests.test_pool import shared_memory
 from tests.test_stream import open_stream
 
 WARM_UP = 0.25  # of the run: allocators and caches fill
@@ -35,11 +35,11 @@ def test_nothing_grows(tmp_path, samples, most_slope_mib, workers):
                 seen += len(batch)
                 loader.state_dict(), loader.stats()
                 if seen == 1_000:
-                    before = held_by(main), sorted(os.listdir("/dev/shm")), [held_by(child) for child in main.children()]
+                    before = held_by(main), shared_memory(), [held_by(child) for child in main.children()]
                 if seen % max(100, samples // 200) == 0:
                     places.append(seen)
                     memory.append([process.memory_info().rss for process in (main, *main.children())])
-        after = held_by(main), sorted(os.listdir("/dev/shm")), [held_by(child) for child in main.children()]
+        after = held_by(main), shared_memory(), [held_by(child) for child in main.children()]
     assert after == before and threading.active_count() >= 1
     late = [i for i, place in enumerate(places) if place > WARM_UP * samples]
     for process in range(1 + workers):

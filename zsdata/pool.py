@@ -272,7 +272,10 @@ def _work(job: Job, channel: socket.socket, ahead: int, activity: Activity, inhe
     while not gone():
         if not poll.poll(1000 * LOOK_SECONDS):
             continue
-        request = channel.recv(REQUEST_BYTES)
+        try:
+            request = channel.recv(REQUEST_BYTES)
+        except ConnectionError:
+            return
         if not request:
             return
         try:
