@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
+import cv2
 import torch
 from torch import Tensor
 
@@ -167,9 +167,10 @@ def make(draft: Draft, depth: DepthMaps, needs: Sequence[str], config: Synthesis
 
 
 def _to_uint8(image: Tensor) -> Tensor:
-    """float32 0..255 to uint8, rounded; the image itself is spent. On the CPU numpy converts, three times as fast as torch."""
-    image.add_(0.5)
-    return torch.from_numpy(image.numpy().astype(np.uint8)) if image.device.type == "cpu" else image.to(torch.uint8)
+    """float32 [C, H, W], 0..255, to uint8, rounded (half to even). On the CPU OpenCV rounds, three times as fast as torch."""
+    if image.device.type == "cpu":
+        return torch.from_numpy(cv2.convertScaleAbs(image.flatten(0, 1).numpy())).view(image.shape)
+    return image.round().to(torch.uint8)
 
 
 def _distinct(samples: Sequence[Any]) -> tuple[list[Any], list[int]]:

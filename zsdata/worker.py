@@ -246,7 +246,9 @@ class Worker:
 
 def _planes(photo: np.ndarray) -> Tensor:
     """uint8 [H, W, 3] to uint8 [3, H, W]."""
-    return torch.from_numpy(np.stack(cv2.split(photo)))
+    planes = np.empty((3, *photo.shape[:2]), np.uint8)
+    cv2.split(photo, [planes[0], planes[1], planes[2]])
+    return torch.from_numpy(planes)
 
 
 def store_depth(cache: DepthCache, digest: str, depth: DepthMaps) -> None:

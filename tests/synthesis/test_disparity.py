@@ -40,6 +40,18 @@ def test_dilation_grows_near_surfaces_by_a_cross():
     assert disparity.count_nonzero() == 1, "the input was changed"
 
 
+@pytest.mark.parametrize("radius_px", [0, 1, 3])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_dilation_takes_the_largest_within_reach_of_each_map(radius_px, dtype):
+    disparity = torch.rand(2, 1, 9, 14, dtype=dtype).transpose(2, 3)
+    grown = dilate_disparity(disparity, radius_px)
+    y, x = torch.meshgrid(torch.arange(14), torch.arange(9), indexing="ij")
+    for v in range(14):
+        for u in range(9):
+            near = (y - v).abs() + (x - u).abs() <= radius_px
+            assert torch.equal(grown[..., v, u], disparity[..., near].amax(-1))
+
+
 def test_sobel_is_the_published_one():
     disparity = torch.rand(1, 1, 30, 40) * 50
     assert np.allclose(sobel_magnitude(disparity)[0, 0].numpy(), sobel(disparity[0, 0].numpy()), atol=1e-4)

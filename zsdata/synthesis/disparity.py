@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -14,6 +15,8 @@ SMALLEST_DISPARITY_PX = 0.01  # of the farthest point; not 0, which marks "no va
 SHARPEN_EDGE_PX = 3.0  # Sobel magnitude above which a disparity belongs to neither side of an edge (the published threshold)
 NEAR_ROWS = 3  # within which nearly every edge value finds one that is none
 NOT_NEAR_PX = 45  # columns off that need no telling apart there; 14 * 45^2 is an int16
+
+_CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,6 +82,11 @@ def dilate_disparity(disparity: Tensor, radius_px: int = 1) -> Tensor:
     """
     if radius_px < 0:
         raise ValueError(f"radius_px must be 0 or more; got {radius_px}")
+    if disparity.device.type == "cpu":  # OpenCV takes the same maximum in a third of the time
+        grown = torch.empty_like(disparity, memory_format=torch.contiguous_format)
+        for source, target in zip(disparity.flatten(0, 1).numpy(), grown.flatten(0, 1).numpy(), strict=True):
+            cv2.dilate(source, _CROSS, dst=target, iterations=radius_px)
+        return grown
     for _ in range(radius_px):
         grown = disparity.clone()
         for here, neighbour in _neighbour_slices():
