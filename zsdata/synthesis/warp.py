@@ -16,6 +16,7 @@ surfaces begin and where they are stretched, are computed as a list.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -83,7 +84,7 @@ def forward_warp(left: Tensor, disparity: Tensor, columns: int | None = None) ->
     parts_of_image = -(-height * width // part_px)
     rows_at_once = -(-height // parts_of_image)
     grid = _Grid.make(images_at_once * rows_at_once, width, columns, reach=int(largest) + 2, device=left.device)
-    memory = _Memory(BYTES_PER_PX * grid.count, left.device)
+    memory = _Memory.get(BYTES_PER_PX * grid.count, left.device)
     right = left.new_empty(channels, batch, height, columns)
     right_disparity = disparity.new_empty(batch, height, columns)
     hole, seen = (torch.empty_like(right_disparity, dtype=torch.bool) for _ in range(2))
@@ -101,10 +102,22 @@ def forward_warp(left: Tensor, disparity: Tensor, columns: int | None = None) ->
 class _Memory:
     """One block for all that is between the steps, used again for each part: fresh memory costs more than the arithmetic on it."""
 
+    _kept = threading.local()
+
     def __init__(self, size: int, device: torch.device) -> None:
         self._size = size
         self._block = torch.empty(size, dtype=torch.uint8, device=device)
         self.used = 0  # bytes; set it back to give back what was taken since
+
+    @classmethod
+    def get(cls, size: int, device: torch.device) -> _Memory:
+        """At least `size` bytes. On the CPU each thread keeps its block for the next image; elsewhere torch keeps it."""
+        if device.type != "cpu":
+            return cls(size, device)
+        kept = getattr(cls._kept, "memory", None)
+        if kept is None or kept._size < size:
+            kept = cls._kept.memory = cls(size, device)
+        return kept
 
     def take(self, count: int, dtype: torch.dtype = torch.float32) -> Tensor:
         """[count], with anything in it."""
