@@ -20,31 +20,18 @@ odd = st.one_of(
     st.tuples(st.integers(-1, 200), st.integers(-1, 200)),
     st.dictionaries(st.text(max_size=2) | st.integers(-1, 2), st.text(max_size=3), max_size=2),
 )
-stream_options = st.fixed_dictionaries(
-    {},
-    optional={
-        "seed": odd,
-        "size": odd,
-        "epoch_size": odd,
-        "views_per_image": odd,
-        "reuse": odd,
-        "depth_placement": odd,
-        "depth_cache_bytes": odd,
-        "disparity": st.sampled_from([None, AdaptiveDisparity(), UniformDisparity()]),
-    },
-)
-loader_options = st.fixed_dictionaries(
-    {"batch_size": st.just(1) | odd},  # so that the others are reached
-    optional={
-        "num_workers": odd,
-        "rank": odd,
-        "world_size": odd,
-        "micro_batch": odd,
-        "multiprocessing_context": odd,
-        "timeout_seconds": odd,
-    },
-)
-thorough = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=150)
+
+
+def some_of(*names):
+    """One odd option, or several."""
+    one = st.sampled_from(names).flatmap(lambda name: st.fixed_dictionaries({name: odd}))
+    return one | st.fixed_dictionaries({}, optional=dict.fromkeys(names, odd))
+
+
+stream_options = some_of("seed", "size", "epoch_size", "views_per_image", "reuse", "depth_placement", "depth_cache_bytes")
+baselines = st.sampled_from([None, AdaptiveDisparity(), UniformDisparity()])
+loader_options = some_of("batch_size", "num_workers", "rank", "world_size", "micro_batch", "multiprocessing_context", "timeout_seconds")
+thorough = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=250)
 
 
 @pytest.fixture(scope="module")
@@ -52,11 +39,11 @@ def tar(tmp_path_factory):
     return photo_tar(tmp_path_factory.mktemp("tar") / "photos.tar", 5)
 
 
-@given(options=stream_options)
+@given(options=stream_options, disparity=baselines)
 @thorough
-def test_stream_options_work_or_are_refused_by_name(tar, options):
+def test_stream_options_work_or_are_refused_by_name(tar, options, disparity):
     try:
-        stream = open_stream(tar, **options)
+        stream = open_stream(tar, disparity=disparity, **options)
     except (ValueError, TypeError) as error:
         assert any(name in str(error) for name in (*options, "weight")), str(error)
     else:
@@ -68,10 +55,10 @@ def test_stream_options_work_or_are_refused_by_name(tar, options):
 def test_loader_options_work_or_are_refused_by_name(tar, options):
     stream = open_stream(tar)
     try:
-        with stream.loader(**options) as loader:
+        with stream.loader(**{"batch_size": 1, **options}) as loader:
             assert 1 <= len(loader) <= len(stream)
     except (ValueError, TypeError) as error:
-        assert any(name in str(error) for name in options), str(error)
+        assert any(name in str(error) for name in ("batch_size", *options)), str(error)
 
 
 @given(sources=odd | st.dictionaries(st.text(max_size=2), st.builds(ImageSource, odd, odd), max_size=2))
