@@ -16,10 +16,12 @@ surfaces begin and where they are stretched, are computed as a list.
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -28,6 +30,7 @@ from zsdata.synthesis.indices import flat_indices
 CPU_PART_PX = 262_144  # warped at once on the CPU: what is between the steps stays in its cache
 PART_PX = 2**28  # elsewhere; pixels are numbered by int32
 BYTES_PER_PX = 64  # of what is between the steps
+ALIGNED_BYTES = 64  # a cache line, on which tensors begin
 # Of the cubic that resamples colours. At 1/2 it is Catmull-Rom's; at 1 a shift by half a pixel leaves the right view as sharp as the left
 # (0.92 of its gradient energy against 0.72), so that blur does not tell the fraction of a disparity. See benchmarks/reprojection.py.
 SHARPNESS = 1.0
@@ -85,9 +88,9 @@ def forward_warp(left: Tensor, disparity: Tensor, columns: int | None = None) ->
     rows_at_once = -(-height // parts_of_image)
     grid = _Grid.make(images_at_once * rows_at_once, width, columns, reach=int(largest) + 2, device=left.device)
     memory = _Memory.get(BYTES_PER_PX * grid.count, left.device)
-    right = left.new_empty(channels, batch, height, columns)
-    right_disparity = disparity.new_empty(batch, height, columns)
-    hole, seen = (torch.empty_like(right_disparity, dtype=torch.bool) for _ in range(2))
+    right = _fresh((channels, batch, height, columns), left.dtype, left.device)
+    right_disparity = _fresh((batch, height, columns), torch.float32, left.device)
+    hole, seen = (_fresh((batch, height, columns), torch.bool, left.device) for _ in range(2))
     for first in range(0, batch, images_at_once):
         for top in range(0, height, rows_at_once):
             images, rows = part = slice(first, first + images_at_once), slice(top, top + rows_at_once)
@@ -99,6 +102,20 @@ def forward_warp(left: Tensor, disparity: Tensor, columns: int | None = None) ->
     return Warped(right.transpose(0, 1).contiguous(), hole.unsqueeze(1), seen.unsqueeze(1), right_disparity.unsqueeze(1))
 
 
+def _fresh(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """A tensor with anything in it.
+
+    On the CPU numpy provides the memory, because it asks for large pages: the first touch of megabytes in small ones takes a third as long
+    as the warp.
+    """
+    if device.type != "cpu":
+        return torch.empty(shape, dtype=dtype, device=device)
+    size = math.prod(shape) * dtype.itemsize
+    block = torch.from_numpy(np.empty(size + ALIGNED_BYTES, np.uint8))
+    start = -block.data_ptr() % ALIGNED_BYTES
+    return block[start : start + size].view(dtype).view(shape)
+
+
 class _Memory:
     """One block for all that is between the steps, used again for each part: fresh memory costs more than the arithmetic on it."""
 
@@ -106,7 +123,7 @@ class _Memory:
 
     def __init__(self, size: int, device: torch.device) -> None:
         self._size = size
-        self._block = torch.empty(size, dtype=torch.uint8, device=device)
+        self._block = _fresh((size,), torch.uint8, device)
         self.used = 0  # bytes; set it back to give back what was taken since
 
     @classmethod
@@ -121,7 +138,7 @@ class _Memory:
 
     def take(self, count: int, dtype: torch.dtype = torch.float32) -> Tensor:
         """[count], with anything in it."""
-        start = -(-self.used // 64) * 64
+        start = -(-self.used // ALIGNED_BYTES) * ALIGNED_BYTES
         end = start + count * dtype.itemsize
         if end > self._size:  # images in float64, or hardly two neighbours on one surface
             return torch.empty(count, dtype=dtype, device=self._block.device)
