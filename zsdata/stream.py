@@ -40,6 +40,7 @@ from zsdata.worker import Recipe, Worker
 logger = logging.getLogger("zsdata")
 
 SMALLEST_CROP_PX = 32
+MOST_SAMPLES_OF_ONE = 100_000  # views of a photo, or uses of a pair; more is a slip
 DEPTH_PLACEMENTS = ("auto", "worker", "device")
 SHARD_CACHE_BYTES = 100_000_000_000
 DEPTH_CACHE_BYTES = 50_000_000_000  # about 50,000 photos of 480x640
@@ -121,8 +122,8 @@ class ZeroStereoStream(IterableDataset):
         ):
             raise ValueError(f"size is (height, width) in pixels, each {SMALLEST_CROP_PX} or more, or None for whole photos; got {size!r}")
         for name, count in (("views_per_image", views_per_image), ("reuse", reuse)):
-            if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-                raise ValueError(f"{name} is an integer, 1 or more; got {count!r}")
+            if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= MOST_SAMPLES_OF_ONE:
+                raise ValueError(f"{name} is an integer, 1 or more and at most {MOST_SAMPLES_OF_ONE:,}; got {count!r}")
         if depth_placement not in DEPTH_PLACEMENTS:
             raise ValueError(f"depth_placement is one of {', '.join(DEPTH_PLACEMENTS)}; got {depth_placement!r}")
         self._depth_placement = depth_placement
