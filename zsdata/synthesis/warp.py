@@ -30,6 +30,7 @@ from zsdata.synthesis.indices import flat_indices
 CPU_PART_PX = 262_144  # warped at once on the CPU: what is between the steps stays in its cache
 PART_PX = 2**28  # elsewhere; pixels are numbered by int32
 BYTES_PER_PX = 64  # of what is between the steps
+RECYCLED_BYTES = 31 * 2**20  # glibc keeps freed memory for its next use as far as the largest block that was ever freed, 32 MiB at most
 ALIGNED_BYTES = 64  # a cache line, on which tensors begin
 # Of the cubic that resamples colours. At 1/2 it is Catmull-Rom's; at 1 a shift by half a pixel leaves the right view as sharp as the left
 # (0.92 of its gradient energy against 0.72), so that blur does not tell the fraction of a disparity. See benchmarks/reprojection.py.
@@ -133,6 +134,7 @@ class _Memory:
             return cls(size, device)
         kept = getattr(cls._kept, "memory", None)
         if kept is None or kept._size < size:
+            np.empty(RECYCLED_BYTES, np.uint8)  # never touched, and given back at once
             kept = cls._kept.memory = cls(size, device)
         return kept
 
@@ -361,8 +363,8 @@ def _special_colours(planes: Tensor, joined: Tensor, special: _Special, limits: 
     source, share, _ = special
     weights = _Weights(*(torch.empty_like(share) for _ in range(3)))
     weights = weights.fill(share, joined.index_select(0, source), joined.index_select(0, source + 2)).to(planes.dtype)
-    last = planes.shape[1] - 1
-    before, here, following, beyond = (planes.index_select(1, (source + step).clamp_(0, last)) for step in (-1, 0, 1, 2))
+    places = [(source + step).clamp_(0, planes.shape[1] - 1) for step in (-1, 0, 1, 2)]
+    before, here, following, beyond = (torch.stack([plane.index_select(0, place) for plane in planes]) for place in places)
     colours = weights.cubic(here, (here - before, following - here, beyond - following), out=before)
     if len(limits) == 1:
         return colours.clamp_(*limits[0])
