@@ -110,12 +110,12 @@ def test_a_small_matcher_overfits_a_handful_of_pairs(tar, tmp_path):
     matcher = load_matcher("raft_stereo", **SMALL)
     matcher.freeze_bn()
     handful = Handful(small_stream(tar, augmentation=AugmentConfig.none()), 4)
-    settings = config(steps=40, iterations=4, save_every=1000)
+    settings = config(steps=80, iterations=4, save_every=1000)
     train(matcher, PAPERS_LOSS, handful, settings, output=tmp_path, model_config={}, arguments={}, tracker=None)
     epes = [json.loads(line)["epe"] for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     disparity = handful.batch.disparity
     blind = (disparity - disparity.median()).abs().mean().item()  # of the best constant
-    assert min(epes[-2:]) < 0.7 * blind
+    assert min(epes[-4:]) < 0.7 * blind  # 0.4 to 0.5 of it over several seeds: single steps jump
 
 
 def fails_at_call(number, loss):
