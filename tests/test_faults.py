@@ -3,6 +3,7 @@ import logging
 import multiprocessing
 import os
 
+import numpy as np
 import pytest
 
 from tests.scenes import jpeg, photo, write_tar
@@ -44,19 +45,40 @@ def test_a_rate_below_the_budget_runs_for_ever():
     assert batches_until_spent(log, 1, 12, most=20_000) is None and log.by_reason == {"truncated": 20_000}
 
 
-def test_ranks_share_the_count_and_each_keeps_the_rate():
+def test_ranks_share_the_count():
     assert batches_until_spent(FaultLog(FailureBudget(count=100), ranks=4), 1, 1) == 26
     assert batches_until_spent(FaultLog(FailureBudget(count=100), ranks=4), 1, 12) is None
+    assert batches_until_spent(FaultLog(FailureBudget(count=0, rate=0), ranks=4), 1, 7) == 1
+
+
+def ranks_until_spent(share, ranks, seed, most=2_000):
+    """Photos that all ranks together have tried when the first of them stops, each photo being bad with this chance; None: none stops."""
+    generator = np.random.default_rng([seed, ranks])
+    logs = [FaultLog(FailureBudget(count=100, rate=0.1), ranks) for _ in range(ranks)]
+    for _ in range(most // 8):
+        for log in logs:
+            try:
+                log.add(8, [reject(0)] * int(generator.negative_binomial(8, 1 - share)))
+            except TooManyFaults:
+                return sum(log.made + log.by_reason.total() for log in logs)
+    return None
+
+
+@pytest.mark.parametrize("ranks", [1, 8, 64])
+def test_however_many_ranks_there_are_the_rate_is_that_of_all_of_them(ranks):
+    """A few bad photos on one of many ranks, which is chance, are not taken for a rate; a rate is."""
+    assert [ranks_until_spent(0.05, ranks, seed) for seed in range(4)] == [None] * 4
+    assert all((ranks_until_spent(0.2, ranks, seed) or 10**9) < 3_000 for seed in range(4))
 
 
 def test_the_error_is_a_summary():
     log = FaultLog(FailureBudget(count=3, rate=0.1), ranks=2)
     with pytest.raises(TooManyFaults) as error:
-        log.add(1, [reject(1), reject(2, "not an image: HTML or XML")])
+        log.add(1, [reject(1), reject(2, "not an image: HTML or XML"), *[reject(3)] * 4])
     assert str(error.value) == (
-        "2 of the last 3 photos were refused, more than the failure budget allows (3, of which each of 2 ranks has its share, and 10%). "
-        "Refused since the start: truncated: 1, not an image: 1; the first: 000001 in a.tar: truncated; "
-        "000002 in a.tar: not an image: HTML or XML. `zsdata verify` lists what is wrong with the shards"
+        "6 of the last 7 photos were refused, more than the failure budget allows (3 over all 2 ranks, and 10%). "
+        "Refused since the start: truncated: 5, not an image: 1; the first: 000001 in a.tar: truncated; "
+        "000002 in a.tar: not an image: HTML or XML; 000003 in a.tar: truncated. `zsdata verify` lists what is wrong with the shards"
     )
 
 

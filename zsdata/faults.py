@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -58,7 +59,8 @@ class FailureBudget:
     all that were tried.
 
     Only the last RECENT_PHOTOS that a rank has tried count, so that a bucket which breaks after a good week is noticed in minutes. Ranks
-    do not ask each other: every rank may refuse its share of `count`. Samples are dealt out at random, so faults fall on all ranks alike.
+    do not ask each other, as one would then wait for another: samples are dealt out at random, so each tells from its own how many all of
+    them have refused, and takes for a higher rate only what chance alone (CHANCE_DEVIATIONS) would not make of its few.
     """
 
     count: int = 100
@@ -70,6 +72,7 @@ class FailureBudget:
 
 
 RECENT_PHOTOS = 10_000  # or ten budgets, if that is more: so many that chance alone does not reach a rate that is well above the true one
+CHANCE_DEVIATIONS = 4.0  # of 64 ranks, none takes 7 % bad photos for more than 10 %; of 15 % the first one knows after 30
 MOST_REASONS = 100  # counted apart; a reason that names numbers must not fill the memory
 OTHER_REASONS = "other reasons"
 
@@ -123,12 +126,14 @@ class FaultLog:
             tried, refused = self._recent.popleft()
             self._tried -= tried
             self._refused -= refused
-        if self._refused > self._budget.count / self._ranks and self._refused > self._budget.rate * self._tried:
+        rate = self._budget.rate
+        by_chance = CHANCE_DEVIATIONS * math.sqrt(rate * (1 - rate) * self._tried) if self._ranks > 1 else 0.0
+        if self._refused * self._ranks > self._budget.count and self._refused > rate * self._tried + by_chance:
             reasons = ", ".join(f"{reason}: {count}" for reason, count in self.by_reason.most_common(10))
-            share = f", of which each of {self._ranks} ranks has its share" if self._ranks > 1 else ""
+            ranks = f" over all {self._ranks} ranks" if self._ranks > 1 else ""
             examples = "; ".join(f"{key} in {shard}: {reason}" for _, shard, key, reason in self.examples[:3])
             raise TooManyFaults(
                 f"{self._refused} of the last {self._tried} photos were refused, more than the failure budget allows "
-                f"({self._budget.count}{share}, and {self._budget.rate:.0%}). Refused since the start: {reasons}; the first: {examples}. "
+                f"({self._budget.count}{ranks}, and {self._budget.rate:.0%}). Refused since the start: {reasons}; the first: {examples}. "
                 "`zsdata verify` lists what is wrong with the shards"
             )
