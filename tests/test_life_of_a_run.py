@@ -104,11 +104,12 @@ def test_a_run_that_is_killed_again_and_again_equals_the_unbroken_one(tar, tmp_p
 
 
 INTERRUPTED = """
-import sys, time
+import signal, sys, time
 sys.path.insert(0, {root!r})
 from tests.test_stream import open_stream
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts what runs in its background with Ctrl-C ignored
     with open_stream({tar!r}).loader(2, num_workers=2, multiprocessing_context={context!r}) as loader:
         next(iter(loader))
         print("going", flush=True)

@@ -1,9 +1,11 @@
 """Several ranks (gloo): whatever goes wrong on one of them, all end, and it is named."""
 
+import json
 import logging
 import multiprocessing
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -13,10 +15,12 @@ from datetime import timedelta
 from pathlib import Path
 
 import pytest
+import torch
 import torch.distributed as dist
+from accelerate import Accelerator
 
-from tests.scenes import grey_fill, photo_tar
-from tests.test_stream import open_stream
+from tests.scenes import grey_fill, layered_depth, photo_tar
+from tests.test_stream import fingerprint, open_stream
 from zsdata.faults import FailureBudget
 from zsdata.position import require_one_place
 
@@ -28,19 +32,41 @@ def nan_fill(right, inpaint_mask, generators):
     return right * float("nan")
 
 
+def killed_in(images):
+    """A depth estimator that is killed at the worker's third photo."""
+    CALLS.append(1)
+    if len(CALLS) > 2 * PASSES:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return layered_depth(images)
+
+
+def asleep_in(images):
+    CALLS.append(1)
+    if len(CALLS) > 2 * PASSES:
+        time.sleep(1_000)
+    return layered_depth(images)
+
+
+DEPTHS = {"worker killed": killed_in, "worker hangs": asleep_in}
+PASSES = 2  # of the depth estimator over a photo: as it is, and mirrored
+CALLS: list[int] = []
+
+
 def train(rank, world, store, tar, case, workers):
     """One rank: a step is a batch and a gradient that all ranks share, as in distributed training."""
-    options, troubled = {}, rank == TROUBLED
+    options, troubled = {"epoch_size": 8 * world}, rank == TROUBLED
     if case == "nan":
         options["inpaint"] = nan_fill if troubled else grey_fill
     if case == "bad shard, budget spent":
-        options["budget"] = FailureBudget(count=0, rate=0.1)
+        options |= {"budget": FailureBudget(count=10, rate=0.1), "epoch_size": 32 * world}
     if case.startswith("bad shard") and troubled:
         damage(tar)
     if case == "cut shard" and troubled:
         data = Path(tar).read_bytes()
         Path(tar).write_bytes(data[: len(data) // 2])
-    stream = open_stream(tar, epoch_size=8 * world, **options)
+    if case in DEPTHS and troubled:
+        options["depth"] = DEPTHS[case]
+    stream = open_stream(tar, **options)
     dist.init_process_group("gloo", init_method=f"file://{store}", rank=rank, world_size=world, timeout=timedelta(seconds=LIMIT_SECONDS))
     if case == "cut shard":
         states: list = [None] * world
@@ -70,7 +96,7 @@ def damage(tar):
     path.write_bytes(data)
 
 
-def run_rank(rank, log, *arguments):
+def run_rank(rank, log, do, *arguments):
     """Into a file of its own, as a launcher does it."""
     with open(log, "w") as file:
         os.dup2(file.fileno(), 1)
@@ -78,7 +104,7 @@ def run_rank(rank, log, *arguments):
         with redirect_stdout(file), redirect_stderr(file):
             logging.basicConfig(force=True)
             try:
-                train(rank, *arguments)
+                do(rank, *arguments)
             except Exception:
                 traceback.print_exc()
                 raise SystemExit(1) from None
@@ -86,12 +112,18 @@ def run_rank(rank, log, *arguments):
 
 def launch(folder, world, case, workers):
     """The exit code and the output of every rank; each has its own copy of the only shard."""
-    context, ranks = multiprocessing.get_context("fork"), []
+    tars = []
     for rank in range(world):
         (folder / str(rank)).mkdir()
-        tar = photo_tar(folder / str(rank) / "photos.tar", 4)
-        arguments = (rank, folder / f"{rank}.log", world, folder / "store", tar, case, workers)
-        ranks.append(context.Process(target=run_rank, args=arguments))
+        tars.append(photo_tar(folder / str(rank) / "photos.tar", 4))
+    return run_ranks(folder, [(train, world, folder / "store", tar, case, workers) for tar in tars])
+
+
+def run_ranks(folder, work):
+    """What each rank does, and its arguments after the rank; the exit codes and outputs."""
+    context, world, ranks = multiprocessing.get_context("fork"), len(work), []
+    for rank, arguments in enumerate(work):
+        ranks.append(context.Process(target=run_rank, args=(rank, folder / f"{rank}.log", *arguments)))
     start = time.monotonic()
     for process in ranks:
         process.start()
@@ -128,13 +160,17 @@ def test_a_bad_shard_on_one_rank_is_counted_there_and_the_steps_stay_equal(tmp_p
     [
         ("bad shard, budget spent", f"rank {TROUBLED} of {{world}} stops: TooManyFaults: "),
         ("nan", f"rank {TROUBLED} of {{world}} stops: ValueError: the inpainter"),
+        ("worker killed", f"rank {TROUBLED} of {{world}} stops: WorkerLost: worker 0 of 1 (process "),
+        pytest.param("worker hangs", f"rank {TROUBLED} of {{world}} stops: WorkerLost: worker 0 of 1 (process ", marks=pytest.mark.slow),
     ],
 )
 def test_a_rank_that_fails_ends_the_others_and_is_named(tmp_path, world, case, message):
     codes, outputs = launch(tmp_path, world, case, 1)
     assert all(code != 0 for code in codes)
     assert message.format(world=world) in outputs[TROUBLED]
-    assert not any("stops: ValueError" in output for rank, output in enumerate(outputs) if rank != TROUBLED)
+    assert not any(
+        message.format(world=world).rpartition(" stops: ")[2] in output for rank, output in enumerate(outputs) if rank != TROUBLED
+    )
 
 
 @pytest.mark.parametrize("world", WORLDS)
@@ -162,3 +198,55 @@ def test_the_launcher_names_a_killed_rank(tmp_path):
     run = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_SECONDS)
     assert run.returncode != 0 and "Signal 9 (SIGKILL)" in run.stderr
     assert f"rank      : {TROUBLED}" in run.stderr
+
+
+def train_under_accelerate(rank, world, port, tar, folder, load, save_after, workers):
+    """Goes on from the checkpoint `load`, saves one after some batches, goes on to the end of the epoch; what it saw of each."""
+    os.environ |= {
+        "RANK": str(rank),
+        "LOCAL_RANK": str(rank),
+        "WORLD_SIZE": str(world),
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": str(port),
+    }
+    accelerator = Accelerator(cpu=True)
+    assert (accelerator.process_index, accelerator.num_processes) == (rank, world)
+    model = accelerator.prepare(torch.nn.Linear(1, 1))
+    place = {"rank": accelerator.process_index, "world_size": accelerator.num_processes}
+    with open_stream(tar, epoch_size=24).loader(1, num_workers=workers, **place) as loader:
+        loader = accelerator.prepare(loader)
+        accelerator.register_for_checkpointing(loader)
+        if load is not None:
+            accelerator.load_state(str(folder / load))
+        seen: list[list] = [[], []]
+        for batch in loader:
+            model(batch.left.mean().view(1, 1)).sum().backward()  # the gradient is what the ranks share
+            seen[len(seen[0]) >= save_after].append([batch.meta[0]["index"], fingerprint(batch[0])])
+            if save_after and len(seen[0]) == save_after and not seen[1]:
+                accelerator.save_state(str(folder / "checkpoint"))
+    (folder / f"seen-{rank}.json").write_text(json.dumps(seen))
+    accelerator.end_training()
+
+
+def in_order(folder, world, part):
+    ranks = [json.loads((folder / f"seen-{rank}.json").read_text())[part] for rank in range(world)]
+    return [pair for step in zip(*ranks, strict=True) for pair in step]
+
+
+def free_port():
+    with socket.socket() as held:
+        held.bind(("127.0.0.1", 0))
+        return held.getsockname()[1]
+
+
+@pytest.mark.parametrize(("before", "after"), [(2, 3), *(pytest.param(*pair, marks=pytest.mark.slow) for pair in ((4, 1), (1, 4), (3, 2)))])
+def test_accelerate_saves_on_some_ranks_and_goes_on_with_others(tmp_path, before, after):
+    tar = photo_tar(tmp_path / "photos.tar", 5)
+    with open_stream(tar, epoch_size=24).loader(1) as loader:
+        unbroken = [[batch.meta[0]["index"], fingerprint(batch[0])] for batch in loader]
+    codes, outputs = run_ranks(tmp_path, [(train_under_accelerate, before, free_port(), tar, tmp_path, None, 12 // before, 1)] * before)
+    assert codes == [0] * before, outputs
+    assert in_order(tmp_path, before, 0) == unbroken[:12] and in_order(tmp_path, before, 1) == unbroken[12:]
+    codes, outputs = run_ranks(tmp_path, [(train_under_accelerate, after, free_port(), tar, tmp_path, "checkpoint", 0, 2)] * after)
+    assert codes == [0] * after, outputs
+    assert in_order(tmp_path, after, 1) == unbroken[12:]
