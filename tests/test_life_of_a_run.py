@@ -4,6 +4,7 @@ import json
 import multiprocessing
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.scenes import photo_tar
+from tests.scenes import jpeg, layered_depth, photo, photo_tar, write_tar
 from tests.test_pool import gone, shared_memory
 from tests.test_stream import fingerprint, open_stream
 
@@ -161,16 +162,51 @@ def test_the_bytes_are_the_same_for_every_way_to_start_processes_and_every_hash_
     assert len(outputs) == 1 and outputs.pop().startswith("12 ")
 
 
-def run_beside(tar, results):
-    with open_stream(tar).loader(BATCH, num_workers=2) as loader:
-        results.send([seen for batch in loader for seen in seen_in(batch)])
+WITH_ONE_PAGE = 'mount -t tmpfs -o size=4096 none /dev/shm && exec "$@"'
 
 
-def test_two_runs_on_one_machine_do_not_meet(tar):
-    context, ends = multiprocessing.get_context("fork"), []
-    for _ in range(2):
+@pytest.mark.parametrize("context", ["fork", *(pytest.param(context, marks=pytest.mark.slow) for context in ("spawn", "forkserver"))])
+def test_a_dev_shm_of_one_page_is_enough(tar, tmp_path, context):
+    """As containers are given 64 MiB, where loaders that hand over batches in it die of a bus error."""
+    own_mounts = ["unshare", "--mount", *([] if os.geteuid() == 0 else ["--user", "--map-root-user"]), "sh", "-c", WITH_ONE_PAGE, "sh"]
+    if shutil.which("unshare") is None or subprocess.run([*own_mounts, "true"], capture_output=True).returncode:
+        pytest.skip("no mounts of one's own here")
+    script = tmp_path / "script.py"
+    script.write_text(DIGESTS.format(root=str(ROOT), tar=tar))
+    environment = {**os.environ, "PYTHONWARNINGS": "ignore"}
+    run = subprocess.run([*own_mounts, sys.executable, str(script), context], capture_output=True, text=True, env=environment, timeout=120)
+    assert run.stdout.startswith("12 "), run.stderr
+
+
+class NamedDepth:
+    cache_name = "layers"
+    __call__ = staticmethod(layered_depth)
+
+
+def run_beside(tar, folder, results):
+    stream = open_stream(tar, depth=NamedDepth(), depth_cache=folder / "depth")
+    with stream.loader(BATCH, num_workers=2, rejected=folder / "rejected.jsonl") as loader:
+        seen = [seen for batch in loader for seen in seen_in(batch)]
+    results.send(seen)
+
+
+def test_two_runs_on_one_machine_do_not_meet(tmp_path):
+    """Though they start at once, fill one depth cache, write one list of refusals, and one of them is killed."""
+    tar = write_tar(tmp_path / "photos.tar", {f"{i}.jpg": jpeg(photo(i)) for i in range(12)} | {"bad.jpg": b"<html>"})
+    context, runs, ends = multiprocessing.get_context("fork"), [], []
+    for _ in range(3):
         ours, theirs = context.Pipe(duplex=False)
-        context.Process(target=run_beside, args=(tar, theirs)).start()
+        runs.append(context.Process(target=run_beside, args=(tar, tmp_path, theirs)))
+        runs[-1].start()
         ends.append(ours)
-    first, second = (end.recv() for end in ends)
-    assert first == second and len(first) == 12
+    runs[2].kill()
+    first, second = (end.recv() for end in ends[:2])
+    for run in runs:
+        run.join(RUN_LIMIT_SECONDS)
+    assert [run.exitcode for run in runs] == [0, 0, -signal.SIGKILL]
+    with open_stream(tar, depth=NamedDepth()).loader(BATCH) as loader:
+        alone = [seen for batch in loader for seen in seen_in(batch)]
+        refused = sum(loader.stats()["rejected"].values())
+    assert first == second == alone and len(first) == 12
+    rows = [json.loads(line) for line in (tmp_path / "rejected.jsonl").read_text().splitlines()]
+    assert {row["key"] for row in rows} == {"bad"} and len(rows) >= 2 * refused > 0

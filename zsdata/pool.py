@@ -67,7 +67,8 @@ class WorkerPool:
     """Batches in the order of the requests; process w makes the requests w, w + n, w + 2 n, ...
 
     Each process has a channel of its own, so that one that is killed leaves no lock behind for the others to wait for. Processes end with
-    the pool and with the process that made it, even when that one is killed.
+    the pool and with the process that made it, even when that one is killed. Batches are handed over in memory without a name (see
+    `zsdata.parcel`), so that it is of no account how small /dev/shm is.
 
     Args:
         requests: taken as far ahead as batches are made ahead.
