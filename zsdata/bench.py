@@ -193,11 +193,11 @@ def leave_holes(right: Tensor, inpaint_mask: Tensor, generators: Sequence[np.ran
     return right
 
 
-def advice(report: BenchReport, *, device: str | torch.device, cores: int, depth_cached: bool) -> str:
+def advice(report: BenchReport, *, device: str | torch.device, cores: int, depth_cached: bool, depth_stored: bool = False) -> str:
     """In words: what bounds the run with the most workers, and what to change."""
     run = report.runs[-1]
     name, share = _largest(report.worker_ms)
-    cure = _cure(name, depth_cached)
+    cure = _cure(name, depth_cached, depth_stored)
     if run.workers and run.waiting < BOUND_BY_WORKERS:
         name, share = _largest(report.finish_ms)
         where = torch.device(device).type
@@ -223,7 +223,9 @@ def advice(report: BenchReport, *, device: str | torch.device, cores: int, depth
     )
 
 
-def _cure(stage: str, depth_cached: bool) -> str:
+def _cure(stage: str, depth_cached: bool, depth_stored: bool) -> str:
+    if stage == "depth" and depth_stored:
+        return "draw several views from a photo (--views-per-image 2), or store its map as .npy, or a smaller one"
     if stage == "depth" and not depth_cached:
         return "keep it on disk (--depth-cache DIR), draw several views from a photo (--views-per-image 2), or take a smaller estimator"
     return {

@@ -36,7 +36,8 @@ from zsdata.source.verify import verify
 from zsdata.sources import parse_sources
 from zsdata.statistics import source_statistics
 from zsdata.stream import ZeroStereoStream
-from zsdata.synthesis.depth import load_depth
+from zsdata.synthesis.depth import DepthEstimator, load_depth
+from zsdata.synthesis.depth.options import STORED
 from zsdata.synthesis.inpaint import Inpainter, load_inpainter
 from zsdata.worker import SHORTEST_SIDE_PX
 
@@ -100,6 +101,7 @@ def _parser() -> argparse.ArgumentParser:
         "pack",
         "pack a folder of photos into shards",
         "Packs the JPEG, PNG and WebP photos in FOLDER and its subfolders into uncompressed tars (shards) in OUTPUT. "
+        "A depth map NAME.depth.npy or NAME.depth.png beside a photo NAME.jpg is packed with it, for --depth stored. "
         "Photos are copied byte for byte; those that zsdata cannot use are left out and listed with the reason. "
         "FOLDER itself stays as it is.",
         example="zsdata pack holiday-photos shards",
@@ -124,7 +126,8 @@ def _parser() -> argparse.ArgumentParser:
         _verify,
         "verify",
         "check every photo of a source",
-        "Walks all shards and decodes every photo. Prints a line per problem (shard, photo, reason) and a summary. "
+        "Walks all shards and decodes every photo, and the depth maps beside them (KEY.depth.npy, KEY.depth.png). "
+        "Prints a line per problem (shard, photo, reason) and a summary. "
         "The exit status is 0 when all is well, 1 when there are problems, 2 when nothing could be checked.",
         example='zsdata verify "shards/{000..099}.tar"',
     )
@@ -134,7 +137,7 @@ def _parser() -> argparse.ArgumentParser:
         _index,
         "index",
         "list the photos of a source once, for all runs to come",
-        "Walks all shards, reads every photo once, and stores where each lies and its checksum: SHARD.index.json beside a local shard, in "
+        "Walks all shards, reads every photo and depth map once, and stores where each lies and its checksum: SHARD.index.json beside a local shard, in "
         "the cache ($ZSDATA_CACHE, or zsdata in the user's cache folder) for a remote one. Opening a source of many shards then takes "
         "moments, and photos that change afterwards are noticed. Indexes that are up to date stay; run it again when a shard has changed.",
         example='zsdata index "shards/{000..099}.tar"',
@@ -262,7 +265,11 @@ def _add_size(command: argparse.ArgumentParser) -> None:
 
 def _add_steps(command: argparse.ArgumentParser) -> None:
     command.add_argument(
-        "--depth", metavar="NAME", default="builtin", help='"builtin", or a Hub id or folder in the transformers format (default: builtin)'
+        "--depth",
+        metavar="NAME",
+        default="builtin",
+        help='"builtin", "stored" (the maps beside the photos, KEY.depth.npy or KEY.depth.png), or a Hub id or folder in the transformers '
+        "format (default: builtin)",
     )
     command.add_argument(
         "--inpaint",
@@ -271,6 +278,11 @@ def _add_steps(command: argparse.ArgumentParser) -> None:
         help='"builtin", "background" (another photo), or a Hub id or folder in the diffusers format (default: builtin)',
     )
     command.add_argument("--seed", metavar="N", type=_count, default=0, help="of the stream (default: %(default)s)")
+
+
+def _depth(options: argparse.Namespace) -> str | DepthEstimator:
+    """Stored depth is the stream's to read; an estimator is loaded here, so that what is wrong with it is told at once."""
+    return STORED if options.depth == STORED else load_depth(options.depth)
 
 
 def _add_overwrite(command: argparse.ArgumentParser) -> None:
@@ -310,7 +322,8 @@ def _pack_and_tell(make_shards: Callable[..., PackReport], options: argparse.Nam
             raise
         raise FileExistsError(f"{error} (--overwrite)") from error
     shards = report.shards[0] if len(report.shards) == 1 else f"{len(report.shards):,} shards, {report.shards[0]} to {report.shards[-1]}"
-    print(f"packed {_several(report.photos, 'photo')} ({_megabytes(report.bytes)}) into {_printable(shards)}")
+    depths = f" with {_several(report.depth_maps, 'depth map')}" if report.depth_maps else ""
+    print(f"packed {_several(report.photos, 'photo')}{depths} ({_megabytes(report.bytes)}) into {_printable(shards)}")
     if report.skipped:
         print(f"skipped {len(report.skipped):,}:")
         for path, reason in report.skipped[:SKIPPED_SHOWN]:
@@ -323,8 +336,9 @@ def _pack_and_tell(make_shards: Callable[..., PackReport], options: argparse.Nam
 
 def _verify(options: argparse.Namespace) -> int:
     report = verify(options.urls, _print_problem, shortest_side_px=SHORTEST_SIDE_PX)
+    depths = f" with {_several(report.depth_maps, 'good depth map')}" if report.depth_maps else ""
     held = f", {report.indexed:,} held against their index" if report.indexed else ""
-    good = f"{_several(report.photos, 'good photo')} in {_several(report.shards, 'shard')}, {_megabytes(report.bytes)}{held}"
+    good = f"{_several(report.photos, 'good photo')}{depths} in {_several(report.shards, 'shard')}, {_megabytes(report.bytes)}{held}"
     if not report.problems:
         print(f"all is well: {good}")
         return OK
@@ -366,7 +380,7 @@ def _preview(options: argparse.Namespace) -> int:
     stream = ZeroStereoStream(
         shards,
         size=tuple(options.size),
-        depth=load_depth(options.depth),
+        depth=_depth(options),
         inpaint=load_inpainter(options.inpaint),
         seed=options.seed,
         augmentation=AugmentConfig.none() if options.clean else None,
@@ -395,7 +409,7 @@ def _stats(options: argparse.Namespace) -> int:
     stream = ZeroStereoStream(
         sources,
         size=None,
-        depth=load_depth(options.depth),
+        depth=_depth(options),
         inpaint=load_inpainter(options.inpaint),
         seed=options.seed,
         augmentation=AugmentConfig.none(),
@@ -422,7 +436,7 @@ def _export(options: argparse.Namespace) -> int:
     stream = ZeroStereoStream(
         shards,
         size=size,
-        depth=load_depth(options.depth),
+        depth=_depth(options),
         inpaint=load_inpainter(options.inpaint),
         seed=options.seed,
         augmentation=AugmentConfig.none(),
@@ -446,7 +460,7 @@ def _export(options: argparse.Namespace) -> int:
 def _bench(options: argparse.Namespace) -> int:
     shards = expand_urls(options.sources)
     device = _device(options.device)
-    load_depth(options.depth)  # what is wrong with it is told first; training is given the name, and every worker loads its own
+    _depth(options)  # what is wrong with it is told first; training is given the name, and every worker loads its own
     inpainter = load_inpainter(options.inpaint, device)
     samples = samples_needed(options.workers, batch_size=options.batch_size, pairs=options.pairs)
 
@@ -468,7 +482,8 @@ def _bench(options: argparse.Namespace) -> int:
         fill_depth_cache(stream_with(leave_holes, AugmentConfig.none()), max(options.workers), samples)
     report = bench(stream, options.workers, batch_size=options.batch_size, pairs=options.pairs, device=device)
     _print_bench(report, options)
-    print(advice(report, device=device, cores=_cores(), depth_cached=options.depth_cache is not None))
+    stored = options.depth == STORED
+    print(advice(report, device=device, cores=_cores(), depth_cached=options.depth_cache is not None, depth_stored=stored))
     return OK
 
 

@@ -29,7 +29,7 @@ from zsdata.worker import Recipe, Worker, naming, single_thread, store_depth
 class Synthesis:
     """Depth and warp on the device: drafts to prepared pairs."""
 
-    depth: DepthEstimator
+    depth: DepthEstimator | None  # None: every draft has its depth
     recipe: Recipe
     worker: Worker  # of the same recipe: draws what stands in for a pair that the quality gate refuses
 
@@ -61,6 +61,8 @@ class Synthesis:
     @torch.no_grad()
     def _estimate(self, drafts: dict[tuple[str, str], Draft], device: torch.device) -> dict[tuple[str, str], DepthMaps]:
         """Depth of the photos of these drafts: by a network with two halves all in one go, otherwise one by one."""
+        if self.depth is None:
+            return {}
         config = self.recipe.synthesis
         photos = [draft.photo.to(device, non_blocking=True) for draft in drafts.values() if draft.photo is not None]
         if as_network(self.recipe.depth) is not None:
@@ -101,7 +103,7 @@ class Finisher:
     def warm_up(self, size: tuple[int, int]) -> list[Any]:
         """Makes the networks ready for crops of this (height, width), as training has memory and no time then; what each of them says."""
         height, width = size
-        steps = [(self.inpainter, (height, width + INPAINT_CONTEXT_PX))]
+        steps: list[tuple[Any, tuple[int, int]]] = [(self.inpainter, (height, width + INPAINT_CONTEXT_PX))]
         if self.synthesis is not None:
             steps.append((self.synthesis.depth, size))
         return [step.warm_up(area) for step, area in steps if hasattr(step, "warm_up")]

@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 from huggingface_hub import metadata_load, try_to_load_from_cache
 
-from zsdata.synthesis.depth.options import DepthNetwork
+from zsdata.synthesis.depth.options import STORED, DepthNetwork
 from zsdata.synthesis.inpaint.options import DiffusionNetwork
 
 OWN_LICENCE = "apache-2.0"
@@ -62,7 +62,7 @@ def model_record(name: str, revision: str | None = None, subfolder: str = "") ->
     """What is known of a model: {"id", "revision", "licence"}, plain JSON values. Nothing is downloaded.
 
     Args:
-        name: a Hub id, a local folder, or the name of a built-in step.
+        name: a Hub id, a local folder, the name of a built-in step, or "stored": whoever packed the depth maps knows their model.
         revision: branch, tag or commit of a Hub id; what is recorded is the commit that it stands for in the local Hub cache, where that
             has it.
         subfolder: where in it the model lies.
@@ -73,6 +73,8 @@ def model_record(name: str, revision: str | None = None, subfolder: str = "") ->
     """
     if name in BUILT_IN:
         return {"id": name, "revision": None, "licence": OWN_LICENCE}
+    if name == STORED:
+        return {"id": name, "revision": None, "licence": None}
     if os.path.isdir(name):
         return {"id": name, "revision": revision, "licence": _card_licence(Path(name), Path(name, subfolder)) or _known_licence(name)}
     snapshot = _snapshot(name, revision, subfolder)

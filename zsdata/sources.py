@@ -14,6 +14,7 @@ from typing import Any
 
 from zsdata.plan import EpochPlan, quotas_for
 from zsdata.source.manifest import Manifest, build_manifest
+from zsdata.synthesis.depth.options import STORED
 
 logger = logging.getLogger("zsdata")
 
@@ -71,9 +72,10 @@ class Schedule:
         sources: as `ZeroStereoStream` takes them: urls, a list of urls, {name: ImageSource or urls}, or {first epoch: any of these}.
         seed, epoch_size: as `ZeroStereoStream` takes them.
         samples_per_photo: samples that are made from one photo, one after another.
+        stored_depth: the photos' depth is read with them, so a source without any depth map is an error.
     """
 
-    def __init__(self, sources: Any, seed: int, epoch_size: int | None, samples_per_photo: int = 1) -> None:
+    def __init__(self, sources: Any, seed: int, epoch_size: int | None, samples_per_photo: int = 1, *, stored_depth: bool = False) -> None:
         if epoch_size is not None and (isinstance(epoch_size, bool) or not isinstance(epoch_size, int) or epoch_size < 1):
             raise ValueError(
                 f"epoch_size is a number of samples, 1 or more, or None for one exact pass over the photos; got {epoch_size!r}"
@@ -81,6 +83,7 @@ class Schedule:
         self._seed = seed
         self._epoch_size = epoch_size
         self._samples_per_photo = samples_per_photo
+        self._stored_depth = stored_depth
         self._manifests: dict[str, Manifest] = {}
         by_epoch = _by_epoch(sources)
         self._starts = sorted(by_epoch)
@@ -116,6 +119,9 @@ class Schedule:
     def _open(self, sources: Any) -> SourceSet:
         named = _by_name(sources)
         manifests = tuple(self._manifest(source.urls) for source in named.values())
+        if self._stored_depth:
+            for name, manifest in zip(named, manifests, strict=True):
+                _check_depth(name, manifest)
         sizes = tuple(len(manifest) for manifest in manifests)
         if self._epoch_size is None and any(source.weight is not None for source in named.values()):
             logger.warning("without epoch_size an epoch is one pass over the photos and the sources' weights change nothing; set it")
@@ -129,6 +135,19 @@ class Schedule:
         if key not in self._manifests:
             self._manifests[key] = build_manifest(urls)
         return self._manifests[key]
+
+
+def _check_depth(name: str, manifest: Manifest) -> None:
+    """Refuses a source without depth maps, and says so of one where some are missing."""
+    photos, missing = len(manifest), len(manifest) - manifest.depth_maps
+    if missing == photos:
+        raise ValueError(
+            f'depth="{STORED}", but not one of the {photos:,} photos of source "{name}" ({manifest.member(0).shard_url}, ...) has a depth '
+            "map: add KEY.depth.npy or KEY.depth.png (16-bit grey) beside KEY.jpg, as `zsdata pack` does with files of these names, or "
+            "let depth be estimated"
+        )
+    if missing:
+        logger.warning('%d of the %d photos of source "%s" have no depth map and are refused when their turn comes', missing, photos, name)
 
 
 def _by_epoch(sources: Any) -> dict[int, Any]:

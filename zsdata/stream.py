@@ -31,6 +31,7 @@ from zsdata.synthesis.depth import DepthEstimator, DepthNetwork, as_network, loa
 from zsdata.synthesis.depth.builtin import warn_once
 from zsdata.synthesis.depth.cache import DepthCache
 from zsdata.synthesis.depth.identity import depth_identity
+from zsdata.synthesis.depth.options import STORED
 from zsdata.synthesis.disparity import AdaptiveDisparity, UniformDisparity
 from zsdata.synthesis.inpaint import DiffusionNetwork, Inpainter, load_inpainter
 from zsdata.synthesis.synthesizer import SynthesisConfig
@@ -61,7 +62,9 @@ class ZeroStereoStream(IterableDataset):
             ({"indoor": ImageSource("in.tar", weight=0.7), "street": ImageSource("out.tar", weight=0.3)}), or any of these by the epoch
             from which they are used ({0: "first.tar", 5: "second.tar"}).
         size: (height, width) of the pairs, in pixels; None gives every pair its photo's own size: the whole photo as it is.
-        depth: "builtin", a Hub id or folder in the transformers format, a `DepthNetwork` with options, or a callable (see `load_depth`).
+        depth: "builtin", a Hub id or folder in the transformers format, a `DepthNetwork` with options, or a callable (see `load_depth`);
+            or "stored": the maps beside the photos, KEY.depth.npy or KEY.depth.png (see `zsdata.source.depth_map`). Their labels have
+            confidence 1, as nothing is known of the mirrored photo; a photo without one is refused.
         inpaint: "builtin", "background", a Hub id or folder in the diffusers format, a `DiffusionNetwork` with options, or a callable (see
             `load_inpainter`).
         disparity: how far apart the cameras stand: AdaptiveDisparity (the paper's) or UniformDisparity (MfS-Stereo's).
@@ -75,7 +78,7 @@ class ZeroStereoStream(IterableDataset):
             loader estimates and warps on its device; "auto": on the device for a network whose loader has a GPU, in the workers otherwise.
             Plain iteration and `replay` do everything on the CPU.
         depth_resolution: the short side of a depth network's input in pixels, or "native", the photo's own size; None is the network's own.
-        commercial_safe: refuses models that are known to be for non-commercial use alone.
+        commercial_safe: refuses models that are known to be for non-commercial use alone. Of stored depth no model is known.
         depth_cache: a folder that keeps the depth of every photo, so that a slow estimator is paid once per photo and not once per epoch.
             Any number of workers, ranks and runs may share it.
         depth_cache_bytes: the most that the folder may hold; 3 bytes per pixel of each photo. A full cache keeps what it has.
@@ -129,7 +132,8 @@ class ZeroStereoStream(IterableDataset):
         self._depth_placement = depth_placement
         self._views_per_image = views_per_image
         self._samples_per_photo = views_per_image * reuse
-        self._schedule = Schedule(sources, seed, epoch_size, self._samples_per_photo)
+        depth = depth if callable(depth) or isinstance(depth, DepthNetwork) else os.fspath(depth)
+        self._schedule = Schedule(sources, seed, epoch_size, self._samples_per_photo, stored_depth=depth == STORED)
         self._revision = 0
         self._told_problems = 0
         self._tell_problems()
@@ -137,9 +141,13 @@ class ZeroStereoStream(IterableDataset):
         self._augmentation = augmentation if augmentation is not None else AugmentConfig()
         self._budget = budget if budget is not None else FailureBudget()
         inpainter = load_inpainter(self._inpaint) if callable(inpaint) or self._inpaint in ("builtin", "background") else None
-        depth = depth if callable(depth) or isinstance(depth, DepthNetwork) else os.fspath(depth)
+        if depth == STORED and depth_cache is not None:
+            raise ValueError(
+                f'depth="{STORED}" is read from the shards, and depth_cache would keep it a second time; leave depth_cache out '
+                "(shard_cache keeps what was read from a url)"
+            )
         if depth_resolution is not None:
-            if not isinstance(depth, str) or depth == "builtin":
+            if not isinstance(depth, str) or depth in ("builtin", STORED):
                 raise ValueError(f"depth_resolution belongs to a network given by name or folder; depth is {_name_of(depth)!r}")
             depth = DepthNetwork(depth, resolution=depth_resolution)
         if commercial_safe:
@@ -345,7 +353,8 @@ class ZeroStereoStream(IterableDataset):
         synthesis = None
         if depth_on_device:
             recipe = replace(recipe, depth_on_device=True)
-            synthesis = Synthesis(load_depth(recipe.depth, device), recipe, Worker(recipe))
+            estimator = None if recipe.depth == STORED else load_depth(recipe.depth, device)
+            synthesis = Synthesis(estimator, recipe, Worker(recipe))
         return Finisher(load_inpainter(self._inpaint, device), self._augmentation, micro_batch, device, synthesis, recipe.reuse)
 
     def _place(self, epoch: int, samples: int) -> Position:

@@ -19,15 +19,17 @@ from zsdata.plan import Choice
 from zsdata.prepared import Draft, Prepared, Rejected, make
 from zsdata.quality import QualityGate
 from zsdata.seeding import rng
-from zsdata.source.photo import decode_rgb, probe_size
+from zsdata.source.depth_map import decode_depth
+from zsdata.source.photo import decode_rgb, probe_photo
 from zsdata.source.shard_cache import ShardCache
 from zsdata.sources import Schedule, SourceSet
 from zsdata.synthesis.depth import DepthEstimator, DepthNetwork, as_network, load_depth
 from zsdata.synthesis.depth.cache import DepthCache, photo_digest
+from zsdata.synthesis.depth.options import STORED
 from zsdata.synthesis.depth.preprocessing import Preprocessing
 from zsdata.synthesis.depth.pretrained import load_preprocessing
 from zsdata.synthesis.disparity import AdaptiveDisparity, UniformDisparity
-from zsdata.synthesis.synthesizer import INPAINT_CONTEXT_PX, DepthMaps, SynthesisConfig, estimate_depth
+from zsdata.synthesis.synthesizer import INPAINT_CONTEXT_PX, DepthMaps, SynthesisConfig, estimate_depth, given_depth
 from zsdata.synthesis.view import ViewConfig, draw_view, view_photo, whole_view
 
 SHORTEST_SIDE_PX = 32  # a photo with a shorter side shows no scene
@@ -56,9 +58,11 @@ class Recipe:
 class _Photo:
     """A photo as far as it has been needed: its pixels and its depth are found once, however many views are drawn from it."""
 
-    def __init__(self, data: bytes) -> None:
+    def __init__(self, data: bytes, stored_depth: bytes | None) -> None:
         self.data = data
-        width, height = probe_size(data)
+        self.stored_depth = stored_depth
+        self.header = probe_photo(data)
+        width, height, _ = self.header
         if min(width, height) < SHORTEST_SIDE_PX:
             raise BadPhoto(f"too small: a side shorter than {SHORTEST_SIDE_PX} px: {width}x{height}")
         self.size = height, width
@@ -198,16 +202,20 @@ class Worker:
         key = manifest.digest, choice.member
         if self._last is not None and self._last[0] == key:
             return self._last[1]
-        with meter.stage("read"):
+        with meter.stage("read"):  # depth first: where there is none, nothing else is read
+            stored_depth = manifest.read_depth(choice.member, self._recipe.shard_cache) if self._recipe.depth == STORED else None
             data = manifest.read(choice.member, self._recipe.shard_cache)
         with meter.stage("decode"):
-            photo = _Photo(data)
+            photo = _Photo(data, stored_depth)
         self._last = (key, photo) if sources.plan.samples_per_photo > 1 else None
         return photo
 
     def _depth_of(self, photo: _Photo, digest: str, rows: tuple[int, int]) -> DepthMaps | None:
-        """Depth of at least these rows: what is known of the photo already, or cached, or estimated now, or None: by the device."""
+        """Depth of at least these rows: what is known of the photo already, or stored, cached, or estimated now, or None: by the device."""
         if photo.depth is not None:
+            return photo.depth
+        if photo.stored_depth is not None:
+            photo.depth = given_depth(torch.from_numpy(decode_depth(photo.stored_depth, photo.header))[None, None])
             return photo.depth
         cache = self._recipe.depth_cache
         cached = cache.load(digest, rows) if cache is not None else None

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from zsdata.faults import BadShard
 from zsdata.source.ranges import ShardFile, ends_inside
-from zsdata.source.tar import find_header, walk_tar
+from zsdata.source.tar import TarMember, find_header, walk_tar
 
 PHOTO_EXTENSIONS = frozenset({"jpg", "jpeg", "png", "webp"})
 OTHER_IMAGE_EXTENSIONS = frozenset(  # of files that a user may take for photos of the source; they are counted, not passed over
@@ -34,6 +34,7 @@ OTHER_IMAGE_EXTENSIONS = frozenset(  # of files that a user may take for photos 
         "raw",
     }
 )
+DEPTH_EXTENSIONS = ("depth.npy", "depth.png")  # of a photo's depth map; where both are there, the first one counts
 MAX_PHOTO_BYTES = 1 << 27  # 128 MiB; a 60-megapixel photo has 10 to 120 MB
 
 
@@ -43,6 +44,19 @@ class PhotoMember(NamedTuple):
     key: str
     offset: int
     size: int
+
+
+class DepthMember(NamedTuple):
+    """A depth map's bytes in its shard; `key` is that of its photo."""
+
+    key: str
+    extension: str  # one of DEPTH_EXTENSIONS
+    offset: int
+    size: int
+
+    def counts_before(self, other: DepthMember | None) -> bool:
+        """Whether this one is used, of two of one photo."""
+        return other is None or DEPTH_EXTENSIONS.index(self.extension) < DEPTH_EXTENSIONS.index(other.extension)
 
 
 class Problem(NamedTuple):
@@ -67,12 +81,19 @@ def split_name(name: str) -> tuple[str, str] | None:
     return folder + slash + stem, extension.lower()
 
 
-def photo_members(file: ShardFile, on_problem: Callable[[Problem], None], *, strict: bool = False) -> Iterator[PhotoMember]:
+def photo_members(
+    file: ShardFile,
+    on_problem: Callable[[Problem], None],
+    *,
+    on_depth: Callable[[DepthMember], None] | None = None,
+    strict: bool = False,
+) -> Iterator[PhotoMember]:
     """The photos of an open shard: regular members with the extension jpg, jpeg, png or webp.
 
     Args:
         on_problem: gets the damages, each member that is meant as a photo but is none (the second of a key, a link, another format), and
-            each sample without a photo.
+            each sample without a photo. Where `on_depth` is given, likewise of depth maps.
+        on_depth: gets each depth map (KEY.depth.npy, KEY.depth.png) as it comes, before or after its photo or without one.
         strict: damage raises instead.
 
     Raises:
@@ -107,18 +128,36 @@ def photo_members(file: ShardFile, on_problem: Callable[[Problem], None], *, str
         elif extension in OTHER_IMAGE_EXTENSIONS:
             reason = f"not a JPEG, PNG or WebP: .{extension}"
         else:
-            beside.setdefault(key, _Beside(member.offset, [])).extensions.append(extension)
+            extensions = beside.setdefault(key, _Beside(member.offset, [])).extensions
+            if on_depth is not None and extension in DEPTH_EXTENSIONS:
+                fault = _depth_fault(member, seen=extension in extensions)
+                if fault is None:
+                    on_depth(DepthMember(key, extension, member.offset, member.size))
+                else:
+                    on_problem(Problem(file.url, key, member.offset, fault))
+            extensions.append(extension)
             continue
         refused.add(key)
         on_problem(Problem(file.url, key, member.offset, reason))
     if last is not None and _ends_in_zeros(file, last):
         end = last.offset + last.size
-        fault = BadShard(f'zeros from inside "{last.key}" to the end: more may be missing; download it again', file.url, end)
+        damage = BadShard(f'zeros from inside "{last.key}" to the end: more may be missing; download it again', file.url, end)
         if strict:
-            raise fault
-        on_damage(fault)
+            raise damage
+        on_damage(damage)
     for problem in _without_photo(file.url, keys, refused, beside):
         on_problem(problem)
+
+
+def _depth_fault(member: TarMember, seen: bool) -> str | None:
+    """Why a member with a depth map's name is not taken; `seen`: the photo has one of that name already."""
+    if member.kind != "file":
+        return f"depth map not a regular file: {member.kind}"
+    if seen:
+        return "duplicate depth map"
+    if member.size > MAX_PHOTO_BYTES:
+        return f"depth map too large: {member.size:,} bytes, at most {MAX_PHOTO_BYTES:,}"
+    return None
 
 
 def _ends_in_zeros(file: ShardFile, photo: PhotoMember) -> bool:
@@ -134,8 +173,9 @@ class _Beside(NamedTuple):
 
 
 def _without_photo(url: str, keys: set[str], refused: set[str], beside: dict[str, _Beside]) -> Iterator[Problem]:
-    """The samples whose photo is missing: they have an annotation as the photos of this shard have it, or a photo by another name."""
-    usual = {extension for key in keys & beside.keys() for extension in beside[key].extensions}
+    """The samples whose photo is missing: they have a depth map, an annotation as the photos of this shard have it, or a photo by another
+    name."""
+    usual = {extension for key in keys & beside.keys() for extension in beside[key].extensions} | set(DEPTH_EXTENSIONS)
     for key, (offset, extensions) in beside.items():
         if key in keys or key in refused:
             continue

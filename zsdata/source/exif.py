@@ -43,6 +43,6 @@ def read_orientation(exif: bytes) -> int:
 
 
 def make_upright(image: np.ndarray, orientation: int) -> np.ndarray:
-    """A stored image [H, W, 3] as it is meant to be seen; the sides swap for orientations 5 to 8."""
+    """A stored image [H, W, 3] or map [H, W] as it is meant to be seen; the sides swap for orientations 5 to 8."""
     turn = _UPRIGHT.get(orientation)
     return image if turn is None else turn(image)

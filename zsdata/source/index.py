@@ -15,22 +15,27 @@ from typing import Any
 
 from tqdm import tqdm
 
-from zsdata.source.archive import MAX_PHOTO_BYTES, Problem, header_inside, photo_members
+from zsdata.source.archive import MAX_PHOTO_BYTES, DepthMember, Problem, header_inside, photo_members
 from zsdata.source.ranges import ShardFile
 from zsdata.source.retry import Stamp
 from zsdata.source.urls import base_name, expand_urls, local_path, shown_url
 
 INDEX_ENDING = ".index.json"
-VERSION = 1
-MAX_INDEX_BYTES = 1 << 28  # 256 MiB; a photo takes about 50 bytes
+VERSION = 2  # 1 had no depth maps
+MAX_INDEX_BYTES = 1 << 28  # 256 MiB; a photo takes about 50 bytes, its depth map 30
 CHECKSUM_UNKNOWN = -1
+NO_DEPTH = -1  # in place of an offset
 CHANGED_BYTES = "damaged: other bytes than when the shard was indexed"
+CHANGED_DEPTH = f"stored depth {CHANGED_BYTES}"
 REMOTE_AT_ONCE = 16  # shards asked for their state at the same time
 
 
 @dataclass
 class Listing:
-    """The photos of one shard in order; `problems` is what could not be taken."""
+    """The photos of one shard in order, and where their depth maps lie; `problems` is what could not be taken.
+
+    The three columns of the depth maps are empty where no photo of the shard has one.
+    """
 
     stamp: Stamp  # of the shard, see `ShardFile`
     keys: list[str] = field(default_factory=list)
@@ -38,11 +43,21 @@ class Listing:
     sizes: array[int] = field(default_factory=lambda: array("i"))
     checksums: array[int] = field(default_factory=lambda: array("q"))  # CRC-32 of the bytes, or CHECKSUM_UNKNOWN
     problems: list[Problem] = field(default_factory=list)
+    depth_offsets: array[int] = field(default_factory=lambda: array("q"))  # NO_DEPTH where a photo has none
+    depth_sizes: array[int] = field(default_factory=lambda: array("i"))
+    depth_checksums: array[int] = field(default_factory=lambda: array("q"))
 
     @property
     def size(self) -> int:
         """Bytes of the shard."""
         return int(self.stamp["size"])  # type: ignore[arg-type]
+
+    def depth_columns(self) -> tuple[array[int], array[int], array[int]]:
+        """Offsets, sizes and checksums of the depth maps, a row for each photo."""
+        if self.depth_offsets:
+            return self.depth_offsets, self.depth_sizes, self.depth_checksums
+        none = len(self.keys)
+        return array("q", [NO_DEPTH]) * none, array("i", [0]) * none, array("q", [CHECKSUM_UNKNOWN]) * none
 
 
 @dataclass
@@ -58,22 +73,41 @@ class IndexReport:
 
 
 def list_shard(url: str, checksums: bool = False) -> Listing:
-    """Walks the headers of a shard; with `checksums` it reads the photos too. Raises what opening it raises."""
+    """Walks the headers of a shard; with `checksums` it reads the photos and depth maps too. Raises what opening it raises."""
+    depths: dict[str, tuple[DepthMember, int]] = {}
     with ShardFile(url) as file:
         listing = Listing(file.stamp)
-        for key, offset, size in photo_members(file, listing.problems.append):
-            checksum = CHECKSUM_UNKNOWN
-            if checksums:
-                data = file.read_at(offset, size)
-                fault = header_inside(file.url, key, offset, data)
-                if fault is not None:
-                    listing.problems.append(Problem(file.url, key, fault.offset, fault.reason))
-                    continue
-                checksum = zlib.crc32(data)
-            listing.keys.append(key)
-            listing.offsets.append(offset)
-            listing.sizes.append(size)
-            listing.checksums.append(checksum)
+
+        def checksum_of(key: str, offset: int, size: int) -> int | None:
+            """None where the bytes cannot be taken."""
+            if not checksums:
+                return CHECKSUM_UNKNOWN
+            data = file.read_at(offset, size)
+            fault = header_inside(file.url, key, offset, data)
+            if fault is None:
+                return zlib.crc32(data)
+            listing.problems.append(Problem(file.url, key, fault.offset, fault.reason))
+            return None
+
+        def add_depth(member: DepthMember) -> None:
+            checksum = checksum_of(member.key, member.offset, member.size)
+            other = depths.get(member.key)
+            if checksum is not None and member.counts_before(other and other[0]):
+                depths[member.key] = member, checksum
+
+        for key, offset, size in photo_members(file, listing.problems.append, on_depth=add_depth):
+            checksum = checksum_of(key, offset, size)
+            if checksum is not None:
+                listing.keys.append(key)
+                listing.offsets.append(offset)
+                listing.sizes.append(size)
+                listing.checksums.append(checksum)
+    if not depths.keys().isdisjoint(listing.keys):
+        for key in listing.keys:
+            member, checksum = depths.get(key, (None, CHECKSUM_UNKNOWN))
+            listing.depth_offsets.append(NO_DEPTH if member is None else member.offset)
+            listing.depth_sizes.append(0 if member is None else member.size)
+            listing.depth_checksums.append(checksum)
     return listing
 
 
@@ -211,6 +245,9 @@ def _to_json(url: str, stamp: dict[str, Any], listing: Listing) -> str:
         "offsets": listing.offsets.tolist(),
         "sizes": listing.sizes.tolist(),
         "crc32": listing.checksums.tolist(),
+        "depth_offsets": listing.depth_offsets.tolist(),
+        "depth_sizes": listing.depth_sizes.tolist(),
+        "depth_crc32": listing.depth_checksums.tolist(),
         "problems": [[problem.key, problem.offset, problem.reason] for problem in listing.problems],
     }
     return json.dumps({**content, "sha256": _digest(content)}, separators=(",", ":"))
@@ -232,6 +269,8 @@ def _from_json(url: str, text: bytes) -> tuple[dict[str, Any], Listing]:
     try:
         stamp, keys = content["stamp"], content["keys"]
         offsets, sizes, checksums = array("q", content["offsets"]), array("i", content["sizes"]), array("q", content["crc32"])
+        depth_offsets, depth_sizes = array("q", content["depth_offsets"]), array("i", content["depth_sizes"])
+        depth_checksums = array("q", content["depth_crc32"])
         problems = [Problem(shown_url(url), key, offset, reason) for key, offset, reason in content["problems"]]
         size = stamp["size"]
         in_order = (
@@ -246,6 +285,28 @@ def _from_json(url: str, text: bytes) -> tuple[dict[str, Any], Listing]:
         )
     except (KeyError, TypeError, OverflowError) as error:
         raise ValueError("a field is missing or of another type") from error
-    if not (in_order and in_range and told and (not offsets or offsets[0] >= 0)):
+    listing = Listing(stamp, keys, offsets, sizes, checksums, problems, depth_offsets, depth_sizes, depth_checksums)
+    if not (in_order and in_range and told and (not offsets or offsets[0] >= 0) and _depths_fit(listing)):
         raise ValueError("members overlap or lie outside of the shard")
-    return stamp, Listing(stamp, keys, offsets, sizes, checksums, problems)
+    return stamp, listing
+
+
+def _depths_fit(listing: Listing) -> bool:
+    """Whether the depth maps lie in the shard, apart from each other and from the photos."""
+    columns = listing.depth_offsets, listing.depth_sizes, listing.depth_checksums
+    if not any(columns):
+        return True
+    if any(len(column) != len(listing.keys) for column in columns):
+        return False
+    depths = []
+    for offset, size, checksum in zip(*columns, strict=True):
+        if offset == NO_DEPTH:
+            if (size, checksum) != (0, CHECKSUM_UNKNOWN):
+                return False
+        elif offset >= 0 and 0 <= size <= MAX_PHOTO_BYTES and 0 <= checksum < 1 << 32:
+            depths.append((offset, size))
+        else:
+            return False
+    members = sorted([*zip(listing.offsets, listing.sizes, strict=True), *depths])
+    ends = [offset for offset, _ in members[1:]] + [listing.size]
+    return all(offset + size <= end for (offset, size), end in zip(members, ends, strict=True))

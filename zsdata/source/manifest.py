@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from zsdata.faults import BadPhoto
 from zsdata.source.archive import Problem, header_inside
-from zsdata.source.index import CHANGED_BYTES, CHECKSUM_UNKNOWN, load_or_list
+from zsdata.source.index import CHANGED_BYTES, CHANGED_DEPTH, CHECKSUM_UNKNOWN, NO_DEPTH, load_or_list
 from zsdata.source.ranges import ShardFile, read_range
 from zsdata.source.retry import Stamp
 from zsdata.source.shard_cache import ShardCache
@@ -56,10 +56,18 @@ class Manifest:
     digest: str
     stamps: tuple[Stamp, ...] | None = None  # what changes with each shard, see `ShardFile`
     checksums: np.ndarray | None = None  # [N] int64, CRC-32 of the bytes where an index knows it, else CHECKSUM_UNKNOWN
+    depth_offsets: np.ndarray | None = None  # [N] int64, bytes; NO_DEPTH of a photo without a depth map; None: no photo has one
+    depth_sizes: np.ndarray | None = None  # [N] int32, bytes
+    depth_checksums: np.ndarray | None = None  # [N] int64
 
     def __len__(self) -> int:
         """How many photos."""
         return len(self.offsets)
+
+    @property
+    def depth_maps(self) -> int:
+        """How many of the photos have a depth map."""
+        return 0 if self.depth_offsets is None else int(np.count_nonzero(self.depth_offsets != NO_DEPTH))
 
     def member(self, index: int) -> Member:
         """Photo `index`, 0 <= index < len(self)."""
@@ -86,18 +94,35 @@ class Manifest:
             OSError: the shard cannot be read; UnreachableShard for a remote one.
         """
         number, key, offset, size = self._place(index)
-        url = self.shard_urls[number]
         checksum = CHECKSUM_UNKNOWN if self.checksums is None else int(self.checksums[index])
+        return self._read(number, key, offset, size, checksum, cache, CHANGED_BYTES)
+
+    def read_depth(self, index: int, cache: ShardCache | None = None) -> bytes:
+        """The bytes of the depth map of photo `index`, read as `read` does.
+
+        Raises:
+            BadPhoto: also where the photo has no depth map.
+        """
+        number, key, _, _ = self._place(index)
+        if self.depth_offsets is None or self.depth_sizes is None or self.depth_offsets[index] == NO_DEPTH:
+            raise BadPhoto(f"no stored depth: neither {key}.depth.npy nor {key}.depth.png; add one, or let depth be estimated", key)
+        checksum = CHECKSUM_UNKNOWN if self.depth_checksums is None else int(self.depth_checksums[index])
+        offset, size = int(self.depth_offsets[index]), int(self.depth_sizes[index])
+        return self._read(number, f"{key}.depth", offset, size, checksum, cache, CHANGED_DEPTH)
+
+    def _read(self, number: int, name: str, offset: int, size: int, checksum: int, cache: ShardCache | None, changed: str) -> bytes:
+        """A member's bytes; `changed` is the reason where they have another checksum."""
+        url = self.shard_urls[number]
         stamp = None if self.stamps is None else self.stamps[number]
         if checksum != CHECKSUM_UNKNOWN and local_path(url) is not None:
             stamp = None  # a file may be touched; its bytes say more
-        data = read_range(url, offset, size, inside=f'"{key}"', stamp=stamp, cache=cache)
+        data = read_range(url, offset, size, inside=f'"{name}"', stamp=stamp, cache=cache)
         if checksum == CHECKSUM_UNKNOWN:
-            fault = header_inside(shown_url(url), key, offset, data)
+            fault = header_inside(shown_url(url), name, offset, data)
             if fault is not None:
                 raise fault
         elif zlib.crc32(data) != checksum:
-            raise BadPhoto(CHANGED_BYTES, key)
+            raise BadPhoto(changed, name)
         return data
 
 
@@ -116,6 +141,7 @@ def build_manifest(urls: str | os.PathLike[str] | Sequence[str | os.PathLike[str
     shard_sizes: list[int] = []
     stamps: list[Stamp] = []
     shard_numbers, offsets, sizes, key_ends, checksums = array("i"), array("q"), array("i"), array("q"), array("q")
+    depth_offsets, depth_sizes, depth_checksums = array("q"), array("i"), array("q")
     key_text = bytearray()
     problems: list[Problem] = []
     stale: list[str] = []
@@ -129,6 +155,8 @@ def build_manifest(urls: str | os.PathLike[str] | Sequence[str | os.PathLike[str
         offsets.extend(listing.offsets)
         sizes.extend(listing.sizes)
         checksums.extend(listing.checksums)
+        for column, values in zip((depth_offsets, depth_sizes, depth_checksums), listing.depth_columns(), strict=True):
+            column.extend(values)
         for key in listing.keys:
             key_text += key.encode("utf-8", "surrogateescape")
             key_ends.append(len(key_text))
@@ -143,12 +171,16 @@ def build_manifest(urls: str | os.PathLike[str] | Sequence[str | os.PathLike[str
         "key_text": bytes(key_text),
         "key_ends": np.array(key_ends, np.int64),
     }
+    with_depth = any(offset != NO_DEPTH for offset in depth_offsets)
+    if with_depth:  # a source without keeps the digest that it has had
+        columns |= {"depth_offsets": np.array(depth_offsets, np.int64), "depth_sizes": np.array(depth_sizes, np.int32)}
     return Manifest(
         shard_urls=tuple(shard_urls),
         shard_sizes=tuple(shard_sizes),
         problems=tuple(problems),
         stamps=tuple(stamps),
         checksums=np.array(checksums, np.int64),
+        depth_checksums=np.array(depth_checksums, np.int64) if with_depth else None,
         digest=_digest(shard_urls, shard_sizes, columns),
         **columns,
     )

@@ -32,7 +32,7 @@ def decode_over_white(data: bytes, transparent_grey: int | None = None) -> np.nd
     Args:
         transparent_grey: the value that a grey PNG declares transparent, at the depth it is decoded to.
     """
-    image = _decode(data, cv2.IMREAD_UNCHANGED)  # which also leaves the orientation alone
+    image = decode_unchanged(data)
     if image.dtype not in (np.uint8, np.uint16) or (image.ndim == 3 and image.shape[2] not in (3, 4)):
         raise BadPhoto(f"damaged: decodes to {image.dtype} {image.shape}")
     height, width = image.shape[:2]
@@ -41,6 +41,11 @@ def decode_over_white(data: bytes, transparent_grey: int | None = None) -> np.nd
     for top in range(0, height, rows):
         rgb[top : top + rows] = _over_white(image[top : top + rows], transparent_grey)
     return rgb
+
+
+def decode_unchanged(data: bytes) -> np.ndarray:
+    """Any image with the channels (BGR, BGRA) and the depth that its file has, as stored (EXIF not applied)."""
+    return _decode(data, cv2.IMREAD_UNCHANGED)  # which also leaves the orientation alone
 
 
 def _over_white(image: np.ndarray, transparent_grey: int | None) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import tarfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -13,11 +13,13 @@ from typing import BinaryIO
 from tqdm import tqdm
 
 from zsdata.faults import BadPhoto
-from zsdata.source.archive import MAX_PHOTO_BYTES, OTHER_IMAGE_EXTENSIONS, PHOTO_EXTENSIONS
+from zsdata.source.archive import DEPTH_EXTENSIONS, MAX_PHOTO_BYTES, OTHER_IMAGE_EXTENSIONS, PHOTO_EXTENSIONS
+from zsdata.source.depth_map import DepthMap, decode_depth
 from zsdata.source.index import INDEX_ENDING
-from zsdata.source.photo import decode_rgb, photo_extension
+from zsdata.source.photo import decode_rgb, photo_extension, probe_photo
 
 _BLOCK = 512
+_DEPTH_FILE = re.compile(rf"(.+)\.({'|'.join(map(re.escape, DEPTH_EXTENSIONS))})", re.IGNORECASE | re.DOTALL)
 _END_OF_ARCHIVE = bytes(2 * _BLOCK)
 
 
@@ -26,6 +28,7 @@ class PackReport:
     """What was packed and what was not."""
 
     photos: int = 0
+    depth_maps: int = 0  # packed with their photos
     bytes: int = 0  # of the shards
     shards: list[str] = field(default_factory=list)  # their paths, in order
     skipped: list[tuple[str, str]] = field(default_factory=list)  # path in the folder, reason
@@ -43,8 +46,9 @@ def pack(
 
     Every photo is decoded once: what zsdata cannot use is left out and reported. Bytes are copied as they are, originals stay untouched.
     A photo's key is its path without the extension, dots in its base name written as "_"; a key that is taken gets "_2", "_3" appended.
-    Its extension is that of its content. The same folder gives the same bytes. Hidden files and files that are no images are passed over;
-    symbolic links are read through.
+    Its extension is that of its content. A depth map NAME.depth.npy or NAME.depth.png goes with the photo NAME.*, as KEY.depth.npy or .png,
+    if a stream can use it (see `zsdata.source.depth_map`); of both the first one. The same folder gives the same bytes. Hidden files and
+    files that are no images are passed over; symbolic links are read through.
 
     Args:
         overwrite: replace shards that `pack` made before under the same name.
@@ -62,24 +66,67 @@ def pack(
         raise ValueError(f"photos_per_shard is at least 1, got {photos_per_shard}")
     name = re.sub(r"[^A-Za-z0-9_-]", "_", source.resolve().name) or "photos"
     _check_output(target, name, overwrite)
-    files = sorted(_image_files(source, target), key=os.fsencode)
+    files = sorted(_files(source, target), key=os.fsencode)
+    photos = [path for path in files if not _DEPTH_FILE.fullmatch(path)]
+    depths = _DepthFiles(source, [path for path in files if _DEPTH_FILE.fullmatch(path)])
     target.mkdir(parents=True, exist_ok=True)
     report, keys = PackReport(), set()
     with _Shards(target, name, photos_per_shard) as shards:
-        for path in tqdm(files, desc="packing", unit="photo", disable=None if progress is None else not progress):
+        for path in tqdm(photos, desc="packing", unit="photo", disable=None if progress is None else not progress):
             try:
                 data, extension = _read_photo(source / path)
             except BadPhoto as fault:
                 report.skipped.append((path, fault.reason))
                 continue
-            shards.add(f"{_free_key(path, keys)}.{extension}", data)
+            key = _free_key(path, keys)
+            members = {f"{key}.{extension}": data}
+            try:
+                depth = depths.of(path, data)
+                if depth is not None:
+                    members[f"{key}.depth.{depth[1]}"] = depth[0]
+                    report.depth_maps += 1
+            except BadPhoto as fault:
+                report.skipped.append((fault.key or path, fault.reason))
+            shards.add(members)
             report.photos += 1
+        report.skipped += depths.left()
         if not report.photos:
             skipped = "".join(f"; {path}: {reason}" for path, reason in report.skipped[:3])
             raise ValueError(f"no photo to pack in {source}: a photo is a JPEG, PNG or WebP file{skipped}")
         report.shards = [os.fspath(path) for path in shards.publish()]
     report.bytes = sum(os.path.getsize(path) for path in report.shards)
     return report
+
+
+class _DepthFiles:
+    """The depth maps in a folder, by the photo that each is of: NAME.depth.npy or NAME.depth.png of NAME.jpg, the case aside."""
+
+    def __init__(self, folder: Path, paths: Sequence[str]) -> None:
+        self._folder = folder
+        self._of: dict[str, dict[str, str]] = {}  # NAME: extension: path
+        for path in paths:
+            name, extension = _DEPTH_FILE.fullmatch(path).groups()  # type: ignore[union-attr]
+            self._of.setdefault(name, {}).setdefault(extension.lower(), path)
+        self._left = dict.fromkeys(paths, "a depth map whose photo is not packed")
+
+    def of(self, photo_path: str, photo: bytes) -> tuple[bytes, str] | None:
+        """Bytes and extension of a photo's depth map; BadPhoto, with the map's path, if a stream cannot use it."""
+        found = self._of.get(photo_path.rpartition(".")[0], {})
+        path = next((found[extension] for extension in DEPTH_EXTENSIONS if extension in found), None)
+        if path is None:
+            return None
+        self._left |= dict.fromkeys(found.values(), f"a second depth map: {path} is the one that counts")
+        self._left.pop(path, None)
+        try:
+            data = _read_file(self._folder / path)
+            decode_depth(data, probe_photo(photo))
+            return data, DepthMap.parse(data).extension
+        except BadPhoto as fault:
+            raise BadPhoto(fault.reason, path) from fault
+
+    def left(self) -> Iterable[tuple[str, str]]:
+        """Path and reason of those that no photo has taken."""
+        return self._left.items()
 
 
 class _Shards:
@@ -93,15 +140,17 @@ class _Shards:
         self._partial: list[Path] = []
         self._file: BinaryIO | None = None
 
-    def add(self, name: str, data: bytes) -> None:
+    def add(self, members: Mapping[str, bytes]) -> None:
+        """The members of one photo, by their names."""
         if self._file is None:
             path = self._target / f"{self._name}-{len(self._partial):06d}.tar.partial"
             path.unlink(missing_ok=True)  # left by a run that was killed
             self._file = open(path, "xb")
             self._partial.append(path)
-        self._file.write(_header(name, len(data)))
-        self._file.write(data)
-        self._file.write(bytes(-len(data) % _BLOCK))
+        for name, data in members.items():
+            self._file.write(_header(name, len(data)))
+            self._file.write(data)
+            self._file.write(bytes(-len(data) % _BLOCK))
         self._photos += 1
         if self._photos % self._photos_per_shard == 0:
             self._finish()
@@ -149,8 +198,8 @@ def _shards_of(target: Path, name: str) -> list[Path]:
     return [path for path in target.glob("*.tar") if re.fullmatch(re.escape(name) + r"-[0-9]{6}\.tar", path.name)]
 
 
-def _image_files(source: Path, output: Path, ancestors: tuple[str, ...] = (), below: str = "") -> Iterator[str]:
-    """Paths of the images below `source`, relative to it; through links, but not round in circles, and not into `output`."""
+def _files(source: Path, output: Path, ancestors: tuple[str, ...] = (), below: str = "") -> Iterator[str]:
+    """Paths of the images and depth maps below `source`, relative to it; through links, but not round in circles, and not into `output`."""
     real = os.path.realpath(source / below)
     if real in ancestors or real == os.path.realpath(output):
         return
@@ -159,24 +208,28 @@ def _image_files(source: Path, output: Path, ancestors: tuple[str, ...] = (), be
             if entry.name.startswith(".") or entry.name == "__MACOSX":
                 continue
             if entry.is_dir():
-                yield from _image_files(source, output, (*ancestors, real), below + entry.name + "/")
-            elif entry.name.rpartition(".")[2].lower() in PHOTO_EXTENSIONS | OTHER_IMAGE_EXTENSIONS:
+                yield from _files(source, output, (*ancestors, real), below + entry.name + "/")
+            elif entry.name.rpartition(".")[2].lower() in PHOTO_EXTENSIONS | OTHER_IMAGE_EXTENSIONS or _DEPTH_FILE.fullmatch(entry.name):
                 yield below + entry.name
 
 
 def _read_photo(path: Path) -> tuple[bytes, str]:
     """A photo's bytes and the extension that fits them; BadPhoto if zsdata cannot use it."""
+    data = _read_file(path)
+    decode_rgb(data)
+    return data, photo_extension(data)
+
+
+def _read_file(path: Path) -> bytes:
     try:
         if not path.is_file():
             raise BadPhoto("not a file, or a link to nothing")
         size = path.stat().st_size
         if size > MAX_PHOTO_BYTES:
             raise BadPhoto(f"too large: {size:,} bytes, at most {MAX_PHOTO_BYTES:,}")
-        data = path.read_bytes()
+        return path.read_bytes()
     except OSError as error:
         raise BadPhoto(f"cannot be read: {error.strerror}") from error
-    decode_rgb(data)
-    return data, photo_extension(data)
 
 
 def _free_key(path: str, keys: set[str]) -> str:

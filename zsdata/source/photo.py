@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -40,6 +42,19 @@ _OTHERS = (  # at byte, signature, name
 )
 
 
+class PhotoHeader(NamedTuple):
+    """What a photo's header says: width and height in pixels as the photo is seen, and the EXIF orientation, 1..8, that makes it so."""
+
+    width: int
+    height: int
+    orientation: int
+
+    @property
+    def stored_size(self) -> tuple[int, int]:
+        """Width and height of the pixels in the file."""
+        return (self.height, self.width) if self.orientation >= 5 else (self.width, self.height)
+
+
 def decode_photo(data: bytes) -> Tensor:
     """A JPEG, PNG or WebP file to uint8 [3, H, W], RGB, as it is meant to be seen.
 
@@ -75,14 +90,20 @@ def decode_rgb(data: bytes, reduction: int = 1) -> np.ndarray:
     return make_upright(image, photo.orientation)
 
 
-def probe_size(data: bytes) -> tuple[int, int]:
-    """Width and height in pixels of what `decode_photo` would return, without decoding.
+def probe_photo(data: bytes) -> PhotoHeader:
+    """The size of what `decode_photo` would return, and how the file is turned, without decoding.
 
     Raises:
         BadPhoto: as far as it can know; whether the memory suffices depends on the reduction.
     """
     photo = _open(data)
-    return (photo.height, photo.width) if photo.orientation >= 5 else (photo.width, photo.height)
+    width, height = (photo.height, photo.width) if photo.orientation >= 5 else (photo.width, photo.height)
+    return PhotoHeader(width, height, photo.orientation)
+
+
+def probe_size(data: bytes) -> tuple[int, int]:
+    """Width and height in pixels of what `decode_photo` would return; as `probe_photo`."""
+    return probe_photo(data)[:2]
 
 
 def photo_extension(data: bytes) -> str:

@@ -17,7 +17,7 @@ SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_CHUNKS = 1_000_000  # real files have pixels in chunks of 8 KB and more
 
 _DECODED = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
-_GREY, _RGB, _GREY_ALPHA, _RGB_ALPHA = 0, 2, 4, 6  # colour types
+GREY, RGB, GREY_ALPHA, RGB_ALPHA = 0, 2, 4, 6  # colour types
 
 
 @dataclass(frozen=True)
@@ -79,13 +79,13 @@ class Png:
         """What the decoder holds beside two RGB images."""
         if not self._needs_blending:
             return 0
-        channels = 1 if self.color_type == _GREY else 4 if self.color_type != _RGB or self.transparency is not None else 3
+        channels = 1 if self.color_type == GREY else 4 if self.color_type != RGB or self.transparency is not None else 3
         bytes_per_pixel = channels * (2 if self.bits == 16 else 1)
         return self.width * self.height * max(0, 2 * bytes_per_pixel - 6)  # it is held twice, but before there is any RGB
 
     @property
     def _needs_blending(self) -> bool:
-        return self.bits > 8 or self.transparency is not None or self.color_type in (_GREY_ALPHA, _RGB_ALPHA)
+        return self.bits > 8 or self.transparency is not None or self.color_type in (GREY_ALPHA, RGB_ALPHA)
 
     def decode(self) -> np.ndarray:
         """uint8 [height, width, 3] RGB over white; 16 bits are rounded to 8."""
@@ -95,7 +95,7 @@ class Png:
 
     def _transparent_grey(self) -> int | None:
         """OpenCV knows the transparent entries of a palette and a transparent colour, but not a transparent grey."""
-        if self.color_type != _GREY or self.transparency is None or len(self.transparency) != 2:
+        if self.color_type != GREY or self.transparency is None or len(self.transparency) != 2:
             return None
         value = int.from_bytes(self.transparency, "big") & ((1 << self.bits) - 1)
         return value if self.bits >= 8 else value * 255 // ((1 << self.bits) - 1)

@@ -84,6 +84,12 @@ def estimate_depth(depth: DepthEstimator, photos: Tensor, config: SynthesisConfi
     return _depth_maps(_checked(estimate, photos), None if mirrored is None else _checked(mirrored, photos))
 
 
+def given_depth(inverse_depth: Tensor) -> DepthMaps:
+    """As `estimate_depth`, of maps that are there already, float [B, 1, h, w]. Nothing is known of the mirrored photo, so every label has
+    confidence 1, as without `flip_confidence`."""
+    return _depth_maps(inverse_depth, None)
+
+
 def predict_depth(depth: Any, prepared: Sequence[Tensor], sizes: Sequence[tuple[int, int]], config: SynthesisConfig) -> list[DepthMaps]:
     """As `estimate_depth`, of photos of several sizes that an estimator with two halves has prepared elsewhere; one map per photo.
 

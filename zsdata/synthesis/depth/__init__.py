@@ -17,16 +17,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from zsdata.synthesis.depth.options import DepthNetwork
+from zsdata.synthesis.depth.options import STORED, DepthNetwork
 
 DepthEstimator = Callable[[Tensor], Tensor]
 
 
 def as_network(depth: str | os.PathLike[str] | DepthNetwork | DepthEstimator) -> DepthNetwork | None:
-    """The network behind the stream's `depth` argument; None for the built-in estimator and for callables."""
+    """The network behind the stream's `depth` argument; None for the built-in estimator, stored depth and callables."""
     if isinstance(depth, DepthNetwork):
         return depth
-    if callable(depth) or os.fspath(depth) == "builtin":
+    if callable(depth) or os.fspath(depth) in ("builtin", STORED):
         return None
     return DepthNetwork(os.fspath(depth))
 
@@ -44,6 +44,7 @@ def load_depth(
 
     Raises:
         TypeError: options for something that takes none.
+        ValueError: "stored", which is no estimator.
     """
     if isinstance(depth, DepthNetwork):
         if options:
@@ -59,6 +60,11 @@ def load_depth(
         from zsdata.synthesis.depth.builtin import BuiltinDepth
 
         return BuiltinDepth()
+    elif os.fspath(depth) == STORED:
+        raise ValueError(
+            f'depth="{STORED}" is no estimator: it stands for the maps beside the photos (KEY.depth.npy, KEY.depth.png), which '
+            "ZeroStereoStream reads; here, name an estimator"
+        )
     else:
         network = DepthNetwork(os.fspath(depth), **options)
     from zsdata.synthesis.depth.pretrained import PretrainedDepth

@@ -7,6 +7,7 @@ from typing import Literal
 
 from zsdata.synthesis.precision import check_dtype
 
+STORED = "stored"  # the name of depth that lies beside the photos and is read with them
 PREDICTIONS = ("inverse depth", "depth")
 
 
