@@ -138,7 +138,9 @@ class BoundedFolder:
                     count = os.pwrite(descriptor, left, offset)
                     left, offset = left[count:], offset + count
             with self._ledger() as ledger:
-                replaced = charge(os.lstat(path).st_size) if os.path.lexists(path) else 0
+                replaced = 0
+                with suppress(FileNotFoundError):  # a reader removes what is damaged, without the lock
+                    replaced = charge(os.lstat(path).st_size)
                 os.replace(temporary, path)
                 ledger.release(min(replaced, charge(size)))
             return True
@@ -204,7 +206,7 @@ class BoundedFolder:
     def _end(self, temporary: str, descriptor: int, size: int) -> None:
         """Closes the file of a writer; where it was not finished it is removed and its bytes are given back."""
         try:
-            if os.path.lexists(temporary):
+            if os.path.lexists(temporary):  # and no other process removes it while it is locked
                 with self._ledger() as ledger:  # both at once: between them a count would be taken off twice
                     os.unlink(temporary)
                     ledger.release(charge(size))
