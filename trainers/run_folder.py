@@ -20,15 +20,17 @@ import torch
 from torch import nn
 
 from trainers.models import save_checkpoint
+from trainers.models.checkpoint import WEIGHTS_FILE
 
 KEPT_CHECKPOINTS = 3
+HIDDEN = ".unfinished"  # ends the names of folders that are being written or removed; what a killed run leaves of them is no checkpoint
 
 
 def save(output: Path, step: int, matcher: nn.Module, config: dict[str, Any], training: dict[str, Any], state: dict[str, Any]) -> Path:
     """Writes the checkpoint of `step` as a whole or not at all; older ones but the last few are removed afterwards."""
 
     def weights(folder: Path) -> None:
-        save_checkpoint(matcher, folder / "model.safetensors")
+        save_checkpoint(matcher, folder / WEIGHTS_FILE)
         (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n")
 
     return write(output, step, weights, training, state)
@@ -37,34 +39,23 @@ def save(output: Path, step: int, matcher: nn.Module, config: dict[str, Any], tr
 def write(output: Path, step: int, weights: Callable[[Path], None], training: dict[str, Any], state: dict[str, Any]) -> Path:
     """As `save`, for any network: `weights(folder)` writes its files."""
     folder = output / "checkpoints" / f"step-{step:08d}"
-    unfinished = folder.with_name(f".{folder.name}.{os.getpid()}")
-    unfinished.mkdir(parents=True)
-    try:
+    folder.parent.mkdir(parents=True, exist_ok=True)
+
+    def fill(unfinished: Path) -> None:
+        unfinished.mkdir()
         weights(unfinished)
         torch.save(training, unfinished / "training.pt")
         (unfinished / "state.json").write_text(json.dumps({"step": step, **state}, indent=2) + "\n")
-        if folder.exists():
-            shutil.rmtree(folder)
-        os.replace(unfinished, folder)
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
+
+    _replace(folder, fill)
     for old in _whole(output)[:-KEPT_CHECKPOINTS]:
-        shutil.rmtree(old)
+        shutil.rmtree(_hide(old))
     return folder
 
 
 def keep_best(checkpoint: Path, output: Path) -> Path:
     """Copies a checkpoint to OUTPUT/best, in the place of an earlier best, as a whole."""
-    best = output / "best"
-    unfinished = output / f".best.{os.getpid()}"
-    try:
-        shutil.copytree(checkpoint, unfinished)
-        if best.exists():
-            shutil.rmtree(best)
-        os.replace(unfinished, best)
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
-    return best
+    return _replace(output / "best", lambda unfinished: shutil.copytree(checkpoint, unfinished))
 
 
 def restore_best(checkpoint: Path, output: Path, step: int) -> bool:
@@ -101,6 +92,44 @@ def load(checkpoint: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """(training, state) of a checkpoint, as they were given to `save`; weights are loaded by `trainers.models.load_checkpoint`."""
     training = torch.load(checkpoint / "training.pt", map_location="cpu", weights_only=True)
     return training, json.loads((checkpoint / "state.json").read_text())
+
+
+def _replace(folder: Path, fill: Callable[[Path], Any]) -> Path:
+    """Puts a new folder, which `fill` fills, in the place of `folder`. At any moment there is the old one, none, or the new one, whole.
+
+    Killed in between, it leaves hidden folders behind, which the next call removes: one run at a time writes to a folder.
+    """
+    for left in folder.parent.glob(f".*{HIDDEN}"):
+        shutil.rmtree(left)
+    unfinished = folder.with_name(f".{folder.name}{HIDDEN}")
+    try:
+        fill(unfinished)
+        for path in [*unfinished.rglob("*"), unfinished]:
+            _flush(path)
+        before = _hide(folder) if folder.exists() else None
+        os.replace(unfinished, folder)
+        _flush(folder.parent)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+    if before is not None:
+        shutil.rmtree(before)
+    return folder
+
+
+def _hide(folder: Path) -> Path:
+    """Out of sight, to be removed: half a checkpoint must not look like one."""
+    hidden = folder.with_name(f".{folder.name}.old{HIDDEN}")
+    os.replace(folder, hidden)
+    return hidden
+
+
+def _flush(path: Path) -> None:
+    """To the disk: after a power failure a name may be there without its bytes."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _whole(output: Path) -> list[Path]:

@@ -1,0 +1,105 @@
+"""Checkpoints: killed at any step of writing one, a run goes on from the last whole one."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+import sys
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch import nn
+
+from trainers import run_folder
+
+TOUCHES = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.scandir", "os.listdir"}  # audit events of files and folders
+
+
+def network(value):
+    net = nn.Linear(3, 2)
+    nn.init.constant_(net.weight, value)
+    return net
+
+
+def save(output, step, value):
+    """A checkpoint whose every file says `value`."""
+    return run_folder.save(output, step, network(value), {"value": value}, {"tensor": torch.full((5,), value)}, {"value": value})
+
+
+def value_of(folder):
+    """What all files of a checkpoint say; that they say the same is what makes it whole."""
+    training, state = run_folder.load(folder)
+    weights = load_file(folder / "model.safetensors")
+    values = {
+        training["tensor"][0].item(),
+        state["value"],
+        weights["weight"][0, 0].item(),
+        json.loads((folder / "config.json").read_text())["value"],
+    }
+    assert len(values) == 1
+    return values.pop()
+
+
+@pytest.fixture(scope="module")
+def before(tmp_path_factory):
+    """A run with as many checkpoints as are kept, and a best one."""
+    output = tmp_path_factory.mktemp("run")
+    for step in range(1, run_folder.KEPT_CHECKPOINTS + 1):
+        save(output, step, float(step))
+    run_folder.keep_best(output / "checkpoints" / "step-00000001", output)
+    return output
+
+
+LAST = run_folder.KEPT_CHECKPOINTS
+ACTIONS = {
+    "a new one": lambda output: save(output, LAST + 1, 10.0),
+    "the last one again": lambda output: save(output, LAST, 10.0),
+    "a new best": lambda output: run_folder.keep_best(output / "checkpoints" / f"step-{LAST:08d}", output),
+}
+
+
+def killed_at(touch, action, output):
+    """In a process of its own: whether it was killed, before its `touch`-th touch of a file or folder."""
+
+    def work():
+        touched = 0
+
+        def watch(event, arguments):
+            nonlocal touched
+            if event in TOUCHES:
+                touched += 1
+                if touched > touch:
+                    os.kill(os.getpid(), signal.SIGKILL)
+
+        sys.addaudithook(watch)
+        action(output)
+
+    process = multiprocessing.get_context("fork").Process(target=work)
+    process.start()
+    process.join()
+    assert process.exitcode in (0, -signal.SIGKILL)
+    return process.exitcode != 0
+
+
+@pytest.mark.parametrize("action", ACTIONS.values(), ids=ACTIONS)
+def test_killed_at_any_touch_of_a_file_there_is_a_whole_checkpoint_and_the_next_one_is_written(before, tmp_path, action):
+    outcomes = set()
+    for touch in range(1_000):
+        output = tmp_path / str(touch)
+        shutil.copytree(before, output)
+        killed = killed_at(touch, action, output)
+        newest = run_folder.newest(output)
+        outcomes.add((newest.name, value_of(newest)))
+        assert all(value_of(folder) for folder in (output / "checkpoints").glob("step-*"))
+        if (output / "best").exists():
+            assert value_of(output / "best") in (1.0, LAST)
+        action(output)  # by a process of the same number, as containers have them
+        folders = sorted(path.name for path in (output / "checkpoints").iterdir())
+        assert len(folders) == LAST and not any(name.startswith(".") for name in (*folders, *os.listdir(output)))
+        if not killed:
+            break
+    assert touch > 10 and len(outcomes) <= 3
