@@ -11,6 +11,8 @@ from torch import Tensor
 
 from trainers.loop import LossFunction, TrainConfig, train
 from trainers.models import Matcher, load_checkpoint
+from trainers.models.checkpoint import WEIGHTS_FILE
+from trainers.models.matcher import SIZE_MULTIPLE_PX
 from trainers.ranks import start_missing_ranks
 from trainers.scores import METRICS
 from trainers.step_guard import TrainingDiverged
@@ -50,10 +52,13 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=("HEIGHT", "WIDTH"),
         help="of the crops, multiples of 32 (default: 384 512)",
     )
-    stream.add_argument("--depth", default="builtin", help='"builtin", or a Hub id or folder in the transformers format (default: builtin)')
+    stream.add_argument(
+        "--depth", default="builtin", metavar="NAME", help='"builtin", or a Hub id or folder in the transformers format (default: builtin)'
+    )
     stream.add_argument(
         "--inpaint",
         default="builtin",
+        metavar="NAME",
         help='"builtin", "background" (another photo, as in MfS-Stereo), "none" (black), or a Hub id or folder in the diffusers format '
         "(default: builtin)",
     )
@@ -81,22 +86,36 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
     )
     stream.add_argument("--no-confidence", action="store_true", help="every label counts fully (no TCG)")
     stream.add_argument("--no-augmentation", action="store_true", help="train on the clean pairs")
-    stream.add_argument("--seed", type=int, default=0, help="of the stream and of the fresh weights (default: 0)")
+    stream.add_argument("--seed", type=int, metavar="N", default=0, help="of the stream and of the fresh weights (default: 0)")
     stream.add_argument(
-        "--workers", type=int, default=defaults.workers, help=f"processes that make pairs, per rank (default: {defaults.workers})"
+        "--workers",
+        type=int,
+        metavar="N",
+        default=defaults.workers,
+        help=f"processes that make pairs, per rank (default: {defaults.workers})",
     )
 
     training = parser.add_argument_group("the training")
-    training.add_argument("--steps", type=int, default=defaults.steps, help=f"optimizer steps in all (default: {defaults.steps:,})")
     training.add_argument(
-        "--batch-size", type=int, default=defaults.batch_size, help=f"pairs per rank and step (default: {defaults.batch_size})"
-    )
-    training.add_argument("--accumulate", type=int, default=1, help="batches per optimizer step (default: 1)")
-    training.add_argument(
-        "--iterations", type=int, default=defaults.iterations, help=f"of the matcher, in training (default: {defaults.iterations})"
+        "--steps", type=int, metavar="N", default=defaults.steps, help=f"optimizer steps in all (default: {defaults.steps:,})"
     )
     training.add_argument(
-        "--learning-rate", type=float, default=defaults.learning_rate, help=f"peak of the one-cycle (default: {defaults.learning_rate})"
+        "--batch-size", type=int, metavar="N", default=defaults.batch_size, help=f"pairs per rank and step (default: {defaults.batch_size})"
+    )
+    training.add_argument("--accumulate", type=int, metavar="N", default=1, help="batches per optimizer step (default: 1)")
+    training.add_argument(
+        "--iterations",
+        type=int,
+        metavar="N",
+        default=defaults.iterations,
+        help=f"of the matcher, in training (default: {defaults.iterations})",
+    )
+    training.add_argument(
+        "--learning-rate",
+        type=float,
+        metavar="X",
+        default=defaults.learning_rate,
+        help=f"peak of the one-cycle (default: {defaults.learning_rate})",
     )
     training.add_argument(
         "--loss",
@@ -113,7 +132,10 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
         "--ema", type=float, metavar="DECAY", help="save and judge a moving average of the weights, such as 0.999 (default: none)"
     )
     training.add_argument(
-        "--initial-weights", type=Path, metavar="FILE", help="a published or own checkpoint to start from (.pth or .safetensors)"
+        "--initial-weights",
+        type=Path,
+        metavar="PATH",
+        help="a published or own checkpoint to start from: .pth, .safetensors, or a folder of a run",
     )
     training.add_argument(
         "--output", type=Path, required=True, metavar="DIR", help="the run's folder: checkpoints, best, logs, evaluations"
@@ -122,13 +144,20 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
         "--resume", type=Path, metavar="DIR", help="go on from the newest checkpoint of that run, or from that checkpoint"
     )
     training.add_argument(
-        "--save-every", type=int, default=defaults.save_every, help=f"steps between checkpoints (default: {defaults.save_every:,})"
+        "--save-every",
+        type=int,
+        metavar="N",
+        default=defaults.save_every,
+        help=f"steps between checkpoints (default: {defaults.save_every:,})",
     )
     training.add_argument(
-        "--tracker", default="tensorboard", help='one of Accelerate\'s trackers (wandb, mlflow, ...), or "none" (default: tensorboard)'
+        "--tracker",
+        default="tensorboard",
+        metavar="NAME",
+        help='one of Accelerate\'s trackers (wandb, mlflow, ...), or "none" (default: tensorboard)',
     )
 
-    evaluation = parser.add_argument_group("the evaluation, at the end and on the way")
+    evaluation = parser.add_argument_group("the evaluation")
     evaluation.add_argument(
         "--evaluate",
         nargs="+",
@@ -144,6 +173,9 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
         help="also every N steps, where a checkpoint is saved, too; OUTPUT/best is the best of them (default: at the end only)",
     )
     evaluation.add_argument(
+        "--evaluate-first", action="store_true", help="also before the first step: what the fresh, or the initial, weights are worth"
+    )
+    evaluation.add_argument(
         "--best-by",
         choices=list(METRICS),
         default=defaults.best_by,
@@ -151,7 +183,11 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
         f"(default: {defaults.best_by})",
     )
     evaluation.add_argument(
-        "--evaluation-iterations", type=int, default=defaults.evaluation_iterations, help=f"default: {defaults.evaluation_iterations}"
+        "--evaluation-iterations",
+        type=int,
+        metavar="N",
+        default=defaults.evaluation_iterations,
+        help=f"default: {defaults.evaluation_iterations}",
     )
 
 
@@ -211,6 +247,7 @@ def train_config(arguments: argparse.Namespace) -> TrainConfig:
         "ema",
         "save_every",
         "evaluate_every",
+        "evaluate_first",
         "best_by",
         "seed",
     )
@@ -226,11 +263,16 @@ def train_as_told(arguments: argparse.Namespace, matcher: Matcher, loss_function
     """Trains a fresh `matcher`, called `name` and built with `options`, as the command line says."""
     matcher.freeze_bn()
     if arguments.initial_weights is not None:
-        load_checkpoint(matcher, arguments.initial_weights)
-    # Before the training, so that a wrong path fails at once.
+        weights = arguments.initial_weights
+        load_checkpoint(matcher, weights / WEIGHTS_FILE if weights.is_dir() else weights)
+    # Before the training, so that a wrong size or path fails at once.
+    height, width = arguments.size
+    if height % SIZE_MULTIPLE_PX or width % SIZE_MULTIPLE_PX or min(height, width) <= 0:
+        raise ValueError(f"--size is a height and a width in multiples of {SIZE_MULTIPLE_PX} px; got {height} {width}")
     sets = [EvaluationSet.parse(spec) for spec in arguments.evaluate]
-    if arguments.evaluate_every is not None and not sets:
-        raise ValueError("--evaluate-every needs --evaluate: what is to be judged on?")
+    if (arguments.evaluate_every is not None or arguments.evaluate_first) and not sets:
+        option = "--evaluate-first" if arguments.evaluate_first else "--evaluate-every"
+        raise ValueError(f"{option} needs --evaluate: what is to be judged on?")
     train(
         matcher,
         loss_function,
@@ -251,6 +293,10 @@ def run(main: Any) -> None:
         start_missing_ranks()
         main()
     except (ValueError, ImportError, OSError, MemoryError, NoUsablePhoto, TooManyFaults, TrainingDiverged, WorkerLost) as error:
+        sys.exit(f"{Path(sys.argv[0]).name}: {error}")
+    except RuntimeError as error:
+        if not isinstance(error.__cause__, (ImportError, OSError)):  # a sample failed for want of a model's file or package
+            raise
         sys.exit(f"{Path(sys.argv[0]).name}: {error}")
     except KeyboardInterrupt:
         sys.exit(130)

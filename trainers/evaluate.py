@@ -56,8 +56,9 @@ def evaluate(
     pictures: Path | None = None,
     total: int | None = None,
     below_px: Sequence[float] = (),
+    progress: bool = True,
 ) -> list[dict[str, Any]]:
-    """Scores of `predict` on each pair, with a progress bar.
+    """Scores of `predict` on each pair.
 
     Args:
         predict: (left, right), RGB float32 [1, 3, H, W], 0..255, on `device` -> disparity [1, 1, H, W], pixels, positive; such as
@@ -66,6 +67,7 @@ def evaluate(
         pictures: a folder for NAME_disparity.png and NAME_error.png.
         total: how many pairs, for the progress bar, where `pairs` does not know.
         below_px: see `trainers.scores.score`.
+        progress: shows a bar.
     Returns:
         For each pair {"name", "group", "seconds"} and the scores by region of `trainers.scores.score`. `mean_scores` sums them up.
     Raises:
@@ -73,7 +75,7 @@ def evaluate(
         MemoryError: a pair does not fit; names it and what helps.
     """
     results = []
-    for pair in tqdm(pairs, total=total, desc="evaluate", unit="pair"):
+    for pair in tqdm(pairs, total=total, desc="evaluate", unit="pair", disable=not progress):
         left, right = (torch.from_numpy(image).to(device).permute(2, 0, 1)[None].float() for image in (pair.left, pair.right))
         begin = time.perf_counter()
         prediction = _predict_or_say_what_helps(predict, left, right, pair.name)
@@ -178,6 +180,30 @@ def _data_sets() -> str:
     return "\n".join(lines)
 
 
+def _above_zero(text: str) -> float:
+    value = float(text)
+    if not value > 0:
+        raise argparse.ArgumentTypeError(f"a disparity above 0 px was expected, got {text}")
+    return value
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"1 or more was expected, got {text}")
+    return value
+
+
+def _device(text: str) -> torch.device:
+    """A device that is there."""
+    try:
+        device = torch.device(text)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise argparse.ArgumentTypeError(f"{text} cannot be used here: {str(error).splitlines()[0]}") from error
+    return device
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, epilog=_data_sets(), formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
@@ -194,7 +220,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--variant", metavar="NAME", help="a resolution (F, H, Q) or render pass (finalpass, cleanpass), see below")
     parser.add_argument(
         "--below",
-        type=float,
+        type=_above_zero,
         nargs="+",
         metavar="PX",
         help="also the scores of the points whose true disparity is smaller, such as 192 (default: 192 on sceneflow, as published)",
@@ -202,9 +228,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--json", type=Path, metavar="OUT", help="write all scores to this file")
     parser.add_argument("--csv", type=Path, metavar="OUT", help="write all scores to this file, a line for each pair and region")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="write NAME_disparity.png and NAME_error.png into this folder")
-    parser.add_argument("--iterations", type=int, default=32, help="updates of the matcher (default: 32)")
+    parser.add_argument("--iterations", type=_count, default=32, metavar="N", help="updates of the matcher (default: 32)")
     parser.add_argument(
-        "--device", default="cuda" if torch.cuda.is_available() else "cpu", help='"cpu", "cuda", "cuda:1" (default: cuda if there is one)'
+        "--device",
+        type=_device,
+        default="cuda" if torch.cuda.is_available() else "cpu",
+        metavar="NAME",
+        help='"cpu", "cuda", "cuda:1" (default: cuda if there is one)',
     )
     parser.add_argument("--mixed-precision", choices=list(PRECISIONS), default="no", help="runs the network under autocast (default: no)")
     parser.add_argument(

@@ -22,12 +22,19 @@ def main() -> None:
     add_training_arguments(parser)
     model = parser.add_argument_group("IGEV-Stereo (defaults as published)")
     model.add_argument(
-        "--hidden-dims", type=int, nargs=3, default=(128, 128, 128), help="channels of the GRUs, coarsest first (default: 128 128 128)"
+        "--hidden-dims",
+        type=int,
+        metavar="N",
+        nargs=3,
+        default=(128, 128, 128),
+        help="channels of the GRUs, coarsest first (default: 128 128 128)",
     )
-    model.add_argument("--corr-levels", type=int, default=2, help="levels of the lookup's pyramids (default: 2)")
-    model.add_argument("--corr-radius", type=int, default=4, help="of the lookup (default: 4)")
+    model.add_argument("--corr-levels", type=int, metavar="N", default=2, help="levels of the lookup's pyramids (default: 2)")
+    model.add_argument("--corr-radius", type=int, metavar="N", default=4, help="of the lookup (default: 4)")
     model.add_argument("--n-gru-layers", type=int, default=3, choices=(1, 2, 3), help="default: 3")
-    model.add_argument("--max-disp", type=int, default=192, help="what the cost volume covers, in pixels, a multiple of 32 (default: 192)")
+    model.add_argument(
+        "--max-disp", type=int, metavar="N", default=192, help="what the cost volume covers, in pixels, a multiple of 32 (default: 192)"
+    )
     model.add_argument("--slow-fast-gru", action="store_true", help="update coarse GRUs more often")
     model.add_argument(
         "--backbone-weights",

@@ -20,6 +20,7 @@ from tqdm import tqdm
 from trainers import run_folder
 from trainers.evaluate import mean_scores, table
 from trainers.models import Matcher, load_checkpoint
+from trainers.models.checkpoint import WEIGHTS_FILE
 from trainers.provenance import provenance
 from trainers.ranks import mean_over_ranks
 from trainers.step_guard import StepGuard
@@ -56,6 +57,7 @@ class TrainConfig:
     ema: float | None = None  # decay of an average of the weights, which is then what is saved and judged
     save_every: int = 5_000
     evaluate_every: int | None = None  # steps; None: at the end only
+    evaluate_first: bool = False  # also before the first step
     best_by: str = BEST_BY
     seed: int = 0
 
@@ -94,8 +96,8 @@ def train(
         model_config: {"model": name, "options": {...}}, saved with the weights.
         arguments: what the run was started with, saved with its state.
         resume: a run's folder or one of its checkpoints.
-        sets: what to judge by at the end and every `config.evaluate_every` steps. Each time a checkpoint is saved, too, and copied to
-            OUTPUT/best when it is the best so far, see `trainers.validation.Validation.is_best`.
+        sets: what to judge by at the end, every `config.evaluate_every` steps, and first of all where `config.evaluate_first`. Each time
+            a checkpoint is saved, too, and copied to OUTPUT/best when it is the best so far, see `Validation.is_best`.
         tracker: any of Accelerate's by name, one of your own, or None.
     Raises:
         ValueError, ImportError, OSError: options, a tracker or a checkpoint that cannot be used.
@@ -142,9 +144,9 @@ def train(
         if planned != config.steps:
             raise ValueError(
                 f"{checkpoint} is of a run of {planned} steps, which its learning rate follows; resume it with --steps {planned}, "
-                f"or start a new run with --initial-weights {checkpoint / 'model.safetensors'}"
+                f"or start a new run with --initial-weights {checkpoint / WEIGHTS_FILE}"
             )
-        load_checkpoint(matcher, checkpoint / "model.safetensors")
+        load_checkpoint(matcher, checkpoint / WEIGHTS_FILE)
     average = None if config.ema is None else WeightAverage(matcher, config.ema)
     if training is not None:
         if training["weights"]:  # what was saved for use is the average
@@ -220,6 +222,9 @@ def train(
     progress = tqdm(total=config.steps, initial=step, unit="step", disable=not accelerator.is_main_process, dynamic_ncols=True)
     mark = _Mark(step, loader.stats()["seconds"].get("wait", 0.0))
     saved_step, judged_step = step, None
+    if validation.sets and config.evaluate_first and step == 0:
+        results = judge()
+        judged_step = step
     while step < config.steps:
         for batch in loader:
             with accelerator.accumulate(model):
@@ -294,7 +299,9 @@ def _write_scores(output: Path, step: int, results: dict[str, list[dict[str, Any
     sets = {name: {"mean": mean_scores(scores), "pairs": scores} for name, scores in results.items()}
     (output / "evaluation.json").write_text(json.dumps({"step": step, "best": validation.best, "sets": sets}, indent=2) + "\n")
     means = {name: one["mean"] for name, one in sets.items()}
-    _append(output / "evaluations.jsonl", {"step": step, validation.best_by: validation.value(results), "means": means})
+    by_pair = {name: {one["name"]: one["all"][validation.best_by] for one in scores} for name, scores in results.items()}
+    line = {"step": step, validation.best_by: validation.value(results), "means": means, f"{validation.best_by}_by_pair": by_pair}
+    _append(output / "evaluations.jsonl", line)
 
 
 def _append(path: Path, values: dict[str, Any]) -> None:

@@ -21,11 +21,16 @@ def main() -> None:
     add_training_arguments(parser)
     model = parser.add_argument_group("RAFT-Stereo (defaults as published)")
     model.add_argument(
-        "--hidden-dims", type=int, nargs=3, default=(128, 128, 128), help="channels of the GRUs, coarsest first (default: 128 128 128)"
+        "--hidden-dims",
+        type=int,
+        metavar="N",
+        nargs=3,
+        default=(128, 128, 128),
+        help="channels of the GRUs, coarsest first (default: 128 128 128)",
     )
     model.add_argument("--corr-implementation", choices=("reg", "alt"), default="reg", help="alt saves memory, same numbers (default: reg)")
-    model.add_argument("--corr-levels", type=int, default=4, help="levels of the correlation pyramid (default: 4)")
-    model.add_argument("--corr-radius", type=int, default=4, help="of the lookup (default: 4)")
+    model.add_argument("--corr-levels", type=int, metavar="N", default=4, help="levels of the correlation pyramid (default: 4)")
+    model.add_argument("--corr-radius", type=int, metavar="N", default=4, help="of the lookup (default: 4)")
     model.add_argument("--n-downsample", type=int, default=2, choices=(2, 3), help="features have 1/2^n of the resolution (default: 2)")
     model.add_argument("--context-norm", choices=NORMS, default="batch", help="in the context encoder (default: batch)")
     model.add_argument("--n-gru-layers", type=int, default=3, choices=(1, 2, 3), help="default: 3")

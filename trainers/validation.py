@@ -70,13 +70,17 @@ class Validation:
         self.best: dict[str, Any] | None = None  # {"step", "value"}
 
     def judge(self, predict: Predict, *, device: torch.device, rank: int, world_size: int) -> dict[str, list[dict[str, Any]]]:
-        """The scores of every pair of every set, as `trainers.evaluate.evaluate` returns them, the same on all ranks."""
+        """The scores of every pair of every set, as `trainers.evaluate.evaluate` returns them, the same on all ranks.
+
+        Rank 0 shows how far it has come.
+        """
         results = {}
         for one in self.sets:
             pairs, total = one.pairs()
             below = BENCHMARKS[one.dataset].below_px if one.dataset in BENCHMARKS else ()
             places = range(rank, total, world_size)
-            scores = evaluate(predict, islice(pairs, rank, None, world_size), device=device, total=len(places), below_px=below)
+            mine = islice(pairs, rank, None, world_size)
+            scores = evaluate(predict, mine, device=device, total=len(places), below_px=below, progress=rank == 0)
             together = gather_object(list(zip(places, scores, strict=True)))
             results[one.name] = [score for _, score in sorted(together, key=lambda entry: entry[0])]
         return results

@@ -174,6 +174,21 @@ def test_sgbm_and_the_motorcycle_need_no_files(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["--device", "banana"], "argument --device: banana cannot be used here"),
+        (["--device", "cuda:99"], "argument --device: cuda:99 cannot be used here"),
+        (["--iterations", "0"], "argument --iterations: 1 or more was expected, got 0"),
+        (["--below", "0"], "argument --below: a disparity above 0 px was expected, got 0"),
+    ],
+)
+def test_a_value_out_of_range_is_refused_with_its_option(monkeypatch, capsys, arguments, message):
+    with pytest.raises(SystemExit):
+        run(monkeypatch, "--model", "sgbm", "--dataset", "motorcycle", *arguments)
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
         (["--model", "raft", "--dataset", "motorcycle"], "--model raft needs --checkpoint"),
         (["--model", "sgbm", "--dataset", "folder"], "--dataset folder needs --root"),
         (["--model", "sgbm", "--dataset", "eth3d"], "--dataset eth3d needs --root"),

@@ -170,7 +170,7 @@ def nan_in_step(number, loss):
 
 
 def test_the_average_the_best_and_the_skipped_steps_come_back_on_resume(tar, tmp_path, pairs_folder):
-    settings = config(steps=7, ema=0.9, save_every=3, evaluate_every=2, evaluation_iterations=2, best_by="epe")
+    settings = config(steps=7, ema=0.9, save_every=3, evaluate_first=True, evaluate_every=2, evaluation_iterations=2, best_by="epe")
     sets = [EvaluationSet.parse(str(pairs_folder))]
     run_training(tar, tmp_path / "unbroken", settings, loss=nan_in_step(4, PAPERS_LOSS), sets=sets)
     loss = nan_in_step(4, PAPERS_LOSS)
@@ -191,7 +191,11 @@ def test_the_average_the_best_and_the_skipped_steps_come_back_on_resume(tar, tmp
     assert all(torch.equal(value, average[name]) for name, value in load_file(last / "model.safetensors").items())
 
     lines = [json.loads(line) for line in (tmp_path / "unbroken" / "evaluations.jsonl").read_text().splitlines()]
-    assert [line["step"] for line in lines] == [2, 4, 6, 7]
+    assert [line["step"] for line in lines] == [0, 2, 4, 6, 7]
+    assert len({line["epe"] for line in lines}) == len(lines), "some weights were judged twice"
+    for line in lines:
+        by_pair = line["epe_by_pair"]["pairs"]
+        assert list(by_pair) == ["far", "near"] and sum(by_pair.values()) / 2 == pytest.approx(line["epe"])
     best = min(lines, key=lambda line: line["epe"])
     for folder in (tmp_path / "unbroken" / "best", tmp_path / "resumed" / "best"):
         assert json.loads((folder / "state.json").read_text())["step"] == best["step"]
@@ -412,7 +416,10 @@ def test_the_command_trains_evaluates_and_resumes(tar, tmp_path, monkeypatch):
         (["--sources", "a=@0.5"], "NAME=URL"),
         (["--evaluate", "nowhere"], "nowhere"),
         (["--evaluate", "kitti2015"], "kitti2015=DIR"),
-        (["--evaluate-every", "2"], "needs --evaluate"),
+        (["--evaluate-every", "2"], "--evaluate-every needs --evaluate"),
+        (["--evaluate-first"], "--evaluate-first needs --evaluate"),
+        (["--size", "100", "128"], "--size is a height and a width in multiples of 32 px; got 100 128"),
+        (["--initial-weights", "nothing.pth"], "no checkpoint file nothing.pth"),
     ],
 )
 def test_a_wrong_argument_is_one_line_in_words(tar, tmp_path, monkeypatch, change, message):

@@ -63,7 +63,7 @@ def test_the_best_is_forgotten_when_another_measure_tells_it():
     assert same.best == first.best and other.best is None
 
 
-def test_ranks_share_the_pairs_and_know_all_scores(tmp_path, monkeypatch):
+def test_ranks_share_the_pairs_and_know_all_scores_and_the_first_shows_how_far_it_is(tmp_path, monkeypatch, capsys):
     write_benchmark("kitti2015", tmp_path)
     seen = []
     entries: list = []
@@ -76,6 +76,7 @@ def test_ranks_share_the_pairs_and_know_all_scores(tmp_path, monkeypatch):
 
     for rank in (1, 0):
         scores = validation.judge(predict, device=torch.device("cpu"), rank=rank, world_size=2)["kitti2015"]
+        assert ("evaluate: 100%" in capsys.readouterr().err) == (rank == 0)
     assert len(seen) == 2 and [score["name"] for score in scores] == ["000000_10", "000001_10"]
 
 

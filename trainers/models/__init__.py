@@ -8,7 +8,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from trainers.models.checkpoint import load_checkpoint, save_checkpoint
+from trainers.models.checkpoint import WEIGHTS_FILE, load_checkpoint, save_checkpoint
 from trainers.models.igev_stereo import IGEVStereo
 from trainers.models.matcher import Matcher
 from trainers.models.raft_stereo import RAFTStereo
@@ -65,5 +65,5 @@ def load_trained(path: str | PathLike[str], name: str, **options: Any) -> Matche
     if trained != name:
         raise ValueError(f"{path} holds a {trained}, not a {name}")
     matcher = load_matcher(name, **(trained_options | options))
-    load_checkpoint(matcher, path / "model.safetensors")
+    load_checkpoint(matcher, path / WEIGHTS_FILE)
     return matcher

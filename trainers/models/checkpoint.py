@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 # What DataParallel and DistributedDataParallel put before every name; the published .pth files carry it.
 WRAPPER_PREFIX = "module."
+WEIGHTS_FILE = "model.safetensors"  # in the folder of a checkpoint
 
 
 def load_checkpoint(matcher: nn.Module, path: str | PathLike[str]) -> None:

@@ -6,6 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from trainers.models.rank_norm import RankBatchNorm3d
+
 Norm2d = type[nn.BatchNorm2d] | type[nn.InstanceNorm2d]
 
 
@@ -26,12 +28,12 @@ def conv_2d(inputs: int, outputs: int, kernel: int = 3, stride: int = 1, norm: N
 
 
 def conv_3d(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> ConvBlock:
-    return ConvBlock(nn.Conv3d(inputs, outputs, kernel, stride, padding=kernel // 2, bias=False), nn.BatchNorm3d(outputs))
+    return ConvBlock(nn.Conv3d(inputs, outputs, kernel, stride, padding=kernel // 2, bias=False), RankBatchNorm3d(outputs))
 
 
 def double_3d(inputs: int, outputs: int) -> ConvBlock:
     """Twice the resolution of all three axes."""
-    return ConvBlock(nn.ConvTranspose3d(inputs, outputs, 4, stride=2, padding=1, bias=False), nn.BatchNorm3d(outputs))
+    return ConvBlock(nn.ConvTranspose3d(inputs, outputs, 4, stride=2, padding=1, bias=False), RankBatchNorm3d(outputs))
 
 
 class JoinFiner(nn.Module):
