@@ -32,6 +32,17 @@ def png(image: np.ndarray) -> bytes:
     return cv2.imencode(".png", image[..., ::-1])[1].tobytes()
 
 
+def npy(values: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, values, allow_pickle=values.dtype.hasobject)
+    return stream.getvalue()
+
+
+def grey16(values: np.ndarray) -> bytes:
+    """A PNG of one channel, as deep as its values."""
+    return cv2.imencode(".png", values)[1].tobytes()
+
+
 def write_tar(path: Path, members: dict[str, bytes]) -> str:
     with tarfile.open(path, "w", format=tarfile.USTAR_FORMAT) as archive:
         for name, data in members.items():

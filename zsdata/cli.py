@@ -137,9 +137,10 @@ def _parser() -> argparse.ArgumentParser:
         _index,
         "index",
         "list the photos of a source once, for all runs to come",
-        "Walks all shards, reads every photo and depth map once, and stores where each lies and its checksum: SHARD.index.json beside a local shard, in "
-        "the cache ($ZSDATA_CACHE, or zsdata in the user's cache folder) for a remote one. Opening a source of many shards then takes "
-        "moments, and photos that change afterwards are noticed. Indexes that are up to date stay; run it again when a shard has changed.",
+        "Walks all shards, reads every photo and depth map once, and stores where each lies and its checksum: SHARD.index.json beside a "
+        "local shard, in the cache ($ZSDATA_CACHE, or zsdata in the user's cache folder) for a remote one. Opening a source of many shards "
+        "then takes moments, and what changes afterwards is noticed. Indexes that are up to date stay; run it again when a shard has "
+        "changed.",
         example='zsdata index "shards/{000..099}.tar"',
     )
     command.add_argument("urls", metavar="SHARDS", nargs="+", help=_URLS)

@@ -88,7 +88,7 @@ class DepthMap:
         if not math.isfinite(high - low):
             count = depth.size - int(np.count_nonzero(np.isfinite(depth)))
             raise BadPhoto(f"stored depth not finite: NaN or infinity at {count:,} of {depth.size:,} pixels; every pixel needs a value")
-        if high - low > np.finfo(np.float32).max:
+        if high - low > float(np.finfo(np.float32).max):
             raise BadPhoto(f"stored depth not finite: from {low:.3g} to {high:.3g} is more than float32 holds")
         if high == low:
             raise BadPhoto(f"stored depth flat: {low:g} at every pixel")
