@@ -1,18 +1,19 @@
-"""trainers/raft.py, but every rank writes down which samples it trained on; on demand the loss of some of its batches is broken.
+"""trainers/raft.py, or igev.py by TRAINER=igev, but every rank writes down which samples it trained on; on demand the loss of some of its batches is broken.
 
 BROKEN_RANK and BROKEN_BY in the environment say where, and what by: {"number of the batch": factor}.
 """
 
+import importlib
 import json
 import os
 import sys
 from pathlib import Path
 
 import trainers.loop as loop
-import trainers.raft as raft
 import trainers.step_guard as step_guard
 from trainers.training_loss import TrainingLoss
 
+trainer = importlib.import_module(f"trainers.{os.environ.get('TRAINER', 'raft')}")
 output = Path(sys.argv[sys.argv.index("--output") + 1])
 rank = os.environ.get("RANK", "0")
 broken_by = json.loads(os.environ["BROKEN_BY"]) if os.environ.get("BROKEN_RANK") == rank else {}
@@ -32,5 +33,5 @@ class Recording(TrainingLoss):
 
 loop.LOG_EVERY_STEPS = 1
 step_guard.FEWEST_STEPS = 1
-raft.TrainingLoss = Recording
-raft.run(raft.main)
+trainer.TrainingLoss = Recording
+trainer.run(trainer.main)

@@ -17,7 +17,7 @@ from accelerate.tracking import GeneralTracker
 from safetensors.torch import load_file
 
 from tests.scenes import grey_fill, layered_depth, photo, photo_tar
-from trainers import loop, raft, run_folder
+from trainers import igev, loop, raft, run_folder
 from trainers.arguments import add_training_arguments, leave_black, open_stream, run
 from trainers.evaluate import evaluate
 from trainers.loop import TrainConfig, train
@@ -339,16 +339,16 @@ def launch(arguments, processes, script="trainers/raft.py", launcher=ACCELERATE,
     return subprocess.run([*map(str, command)], cwd=ROOT, capture_output=True, text=True, env=environment, timeout=240)
 
 
-def arguments_for(tar, output, *more):
+def arguments_for(tar, output, *more, small=SMALL_ARGUMENTS):
     given = ["--sources", tar, "--size", 64, 96, "--batch-size", 1, "--iterations", 2, "--workers", 0, "--output", output]
-    return [*given, *SMALL_ARGUMENTS, *more]
+    return [*given, *small, *more]
 
 
-def run_command(monkeypatch, *arguments):
+def run_command(monkeypatch, *arguments, trainer=raft):
     """trainers/raft.py in this process, which logs every step."""
     monkeypatch.setattr(sys, "argv", ["raft.py", *map(str, arguments), "--tracker", "none"])
     monkeypatch.setattr(loop, "LOG_EVERY_STEPS", 1)
-    run(raft.main)
+    run(trainer.main)
     AcceleratorState._reset_state(reset_partial_state=True)
 
 
@@ -356,8 +356,11 @@ def read_lines(path):
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def test_two_ranks_train_as_one_with_twice_the_batch_and_one_goes_on_where_two_stopped(tar, tmp_path, monkeypatch):
-    two, one, resumed = (tmp_path / name for name in ("two", "one", "resumed"))
+TERMS = ("loss", "epe", "disparity_term", "photometric_term", "gradient_norm")
+
+
+def test_two_ranks_train_as_one_with_twice_the_batch_and_each_goes_on_where_the_other_stopped(tar, tmp_path, monkeypatch):
+    two, one, one_resumed, two_resumed = (tmp_path / name for name in ("two", "one", "one-resumed", "two-resumed"))
     options = ("--steps", 4, "--save-every", 2)
     done = launch(arguments_for(tar, two, *options), 2, script="tests/trainers/record_samples.py")
     assert done.returncode == 0, done.stderr[-3000:]
@@ -365,15 +368,35 @@ def test_two_ranks_train_as_one_with_twice_the_batch_and_one_goes_on_where_two_s
     assert ranks == [[(0, 0), (0, 2), (0, 4), (0, 6)], [(0, 1), (0, 3), (0, 5), (0, 7)]]
 
     run_command(monkeypatch, *arguments_for(tar, one, *options, "--batch-size", 2))
-    checkpoint = two / "checkpoints" / "step-00000002"
-    run_command(monkeypatch, *arguments_for(tar, resumed, *options, "--batch-size", 2, "--resume", checkpoint))
-    logs = [read_lines(folder / "log.jsonl") for folder in (two, one, resumed)]
+    resume = ("--resume", two / "checkpoints" / "step-00000002")
+    run_command(monkeypatch, *arguments_for(tar, one_resumed, *options, "--batch-size", 2, *resume))
+    resume = ("--resume", one / "checkpoints" / "step-00000002")
+    done = launch(arguments_for(tar, two_resumed, *options, *resume), 2, "tests/trainers/record_samples.py", TORCHRUN)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert [read_lines(two_resumed / f"samples-{rank}.jsonl") for rank in range(2)] == [[[0, 4], [0, 6]], [[0, 5], [0, 7]]]
+    logs = [read_lines(folder / "log.jsonl") for folder in (two, one, one_resumed, two_resumed)]
     assert [line["samples"] for line in logs[0]] == [line["samples"] for line in logs[1]] == [2, 4, 6, 0]
-    assert [(line["step"], line["samples"]) for line in logs[2]] == [(3, 6), (4, 0)]
-    for name in ("loss", "epe", "disparity_term", "photometric_term", "gradient_norm"):
+    for log in logs[2:]:
+        assert [(line["step"], line["samples"]) for line in log] == [(3, 6), (4, 0)]
+    for name in TERMS:
         curves = [[line[name] for line in log] for log in logs]
         assert curves[1] == pytest.approx(curves[0], rel=1e-5), name
-        assert curves[2] == pytest.approx(curves[0][2:], rel=1e-5), name
+        for curve in curves[2:]:
+            assert curve == pytest.approx(curves[0][2:], rel=1e-5), name
+
+
+def test_two_ranks_train_igev_stereo_as_one_with_twice_the_batch(tar, tmp_path, monkeypatch):
+    """As its volumes are normalised by the pairs of both ranks."""
+    two, one = tmp_path / "two", tmp_path / "one"
+    small = "--hidden-dims 16 16 16 --corr-radius 2 --max-disp 32 --n-gru-layers 2 --steps 4".split()
+    done = launch(arguments_for(tar, two, small=small), 2, "tests/trainers/record_samples.py", TORCHRUN, TRAINER="igev")
+    assert done.returncode == 0, done.stderr[-3000:]
+    run_command(monkeypatch, *arguments_for(tar, one, "--batch-size", 2, small=small), trainer=igev)
+    logs = [read_lines(folder / "log.jsonl") for folder in (two, one)]
+    assert len(logs[0]) == 4
+    for name in (*TERMS, "initial_term"):
+        curves = [[line[name] for line in log] for log in logs]
+        assert curves[1] == pytest.approx(curves[0], rel=1e-4), name
 
 
 def test_a_nan_or_an_explosion_on_one_rank_skips_the_step_on_both(tar, tmp_path):

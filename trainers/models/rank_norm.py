@@ -24,7 +24,8 @@ class RankBatchNorm3d(nn.BatchNorm3d):
         ranks = distributed.get_world_size() if distributed.is_available() and distributed.is_initialized() else 1
         if not self.training or ranks == 1:
             return super().forward(input)
-        assert self.running_mean is not None and self.running_var is not None and self.num_batches_tracked is not None
+        assert self.running_mean is not None and self.running_var is not None
+        assert self.num_batches_tracked is not None and self.momentum is not None
         volume = input.float()  # under autocast it may be in half precision, in which sums of so many values drown
         mean = mean_over_ranks(volume.mean(VOLUME_AXES))
         centred = volume - _along_channels(mean)
