@@ -5,7 +5,8 @@ python benchmarks/matchers.py --device cuda --json matchers.json  the paper's: b
 python benchmarks/matchers.py --models raft --ways bf16           parts of the table
 
 Every way starts from the same weights and sees the same pairs, in one process; float32 is eager, with TF32 off, and what the others are
-measured by. To compile takes minutes on the CPU, and is done there only for --ways that say so.
+measured by; the column "x tf32" measures them by eager TF32. To compile takes minutes on the CPU, and is done there only for --ways that
+say so.
 A training step is forward, ZeroStereo loss, backward, clipping and AdamW. Medians after a warm-up, on the CPU of the process's own
 time, which others on the machine do not change. The peak is that of tensors on a GPU, and of the whole process on the CPU. The last column
 is how far the last prediction is from float32's, averaged over the pixels, as a share of the largest disparity; where that is more
@@ -202,6 +203,10 @@ def machine(device: torch.device) -> dict[str, Any]:
     }
 
 
+def _ratio(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu", help='"cpu" or "cuda"; sets the defaults of what follows (default: cpu)')
@@ -221,7 +226,7 @@ def main() -> None:
     given = {name: getattr(arguments, name) for name in Sizes.__dataclass_fields__}
     sizes = Sizes(**{name: getattr(defaults, name) if value is None else value for name, value in given.items()})
     usual = [name for name, way in WAYS.items() if device.type == "cuda" or not (way.tf32 or way.compiled)]
-    ways = ["float32", *[way for way in arguments.ways or usual if way != "float32"]]
+    ways = ["float32", *sorted(set(arguments.ways or usual) - {"float32"}, key=list(WAYS).index)]  # TF32 second
 
     report: dict[str, Any] = {"machine": machine(device), "sizes": vars(sizes), "rows": []}
     print(json.dumps(report["machine"]))
@@ -231,13 +236,13 @@ def main() -> None:
     )
     report["loss_ms"] = 1e3 * measure_loss(sizes, device)
     print(f"the loss alone, forward and backward: {report['loss_ms']:.1f} ms")
-    print(f"{'':33}{'training step':>31}{'inference':>31}{'in all':>9}{'off by':>10}")
-    print(f"{'':33}" + f"{'ms':>12}{'x float32':>11}{'GiB':>8}" * 2 + f"{'s':>9}{'share':>10}")
+    print(f"{'':33}{'training step':>39}{'inference':>39}{'in all':>9}{'off by':>10}")
+    print(f"{'':33}" + f"{'ms':>12}{'x float32':>11}{'x tf32':>8}{'GiB':>8}" * 2 + f"{'s':>9}{'share':>10}")
     wrong = []
     for model in arguments.models:
         torch.manual_seed(0)
         weights = load_matcher(MODELS[model]).state_dict()
-        plain: dict[str, float] = {}
+        plain: dict[str, dict[str, float]] = {}  # what the others are measured by
         expected = torch.zeros(())
         for name in tqdm(ways, desc=model, leave=False, disable=not sys.stderr.isatty()):
             gc.collect()
@@ -248,16 +253,20 @@ def main() -> None:
             except torch.OutOfMemoryError:
                 print(f"{model + ' ' + name:33}out of memory")
                 continue
+            if name in ("float32", "tf32"):
+                plain[name] = used
             if name == "float32":
-                plain, expected = used, prediction
+                expected = prediction
             row: dict[str, Any] = {"model": model, "way": name, **used}
-            if plain:
-                row |= {f"{part}_ratio": plain[f"{part}_seconds"] / used[f"{part}_seconds"] for part in ("step", "inference")}
+            for other, seconds in plain.items():
+                row |= {f"{part}_x_{other}": seconds[f"{part}_seconds"] / used[f"{part}_seconds"] for part in ("step", "inference")}
+            if "float32" in plain:
                 row["deviation"] = ((prediction - expected).abs().mean() / expected.abs().max()).item()
                 if not row["deviation"] <= DEVIATIONS[name.split("+")[0]]:
                     wrong.append(f"{model} {name} is off by {row['deviation']:.2g} of the largest prediction")
             cells = [
-                f"{1e3 * row[f'{part}_seconds']:12.1f}{row.get(f'{part}_ratio', float('nan')):11.2f}{row[f'{part}_peak_gib']:8.2f}"
+                f"{1e3 * row[f'{part}_seconds']:12.1f}{_ratio(row.get(f'{part}_x_float32')):>11}{_ratio(row.get(f'{part}_x_tf32')):>8}"
+                f"{row[f'{part}_peak_gib']:8.2f}"
                 for part in ("step", "inference")
             ]
             rest = f"{row['total_seconds']:9.0f}{row.get('deviation', float('nan')):10.1e}"

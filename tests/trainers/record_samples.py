@@ -1,6 +1,6 @@
-"""trainers/raft.py, or igev.py by TRAINER=igev, but every rank writes down which samples it trained on; on demand the loss of some of its batches is broken.
+"""A trainer, but every rank writes down which samples it trained on; on demand the loss of some of its batches is broken.
 
-BROKEN_RANK and BROKEN_BY in the environment say where, and what by: {"number of the batch": factor}.
+In the environment, TRAINER says which one, raft or igev; BROKEN_RANK and BROKEN_BY say where, and what by: {"number of the batch": factor}.
 """
 
 import importlib
