@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from zsdata.source.urls import base_name, expand_urls, local_path, shown_url, without_secrets
+from zsdata.source.urls import _names_in, base_name, expand_urls, local_path, shown_url, without_secrets
 
 
 @pytest.fixture
@@ -134,9 +134,44 @@ def test_the_name_of_a_shard_has_no_folder_and_no_token():
     assert base_name("/a/b/c.tar") == base_name("https://h/x/c.tar?token=1#2") == base_name("s3://bucket/c.tar") == "c.tar"
 
 
-@pytest.mark.parametrize(
-    "spec", ["a/{0..99999999}.tar", "a/{000..999}/{00000..99999}.tar", "{-9999999999999999..9}.tar", "{0..99999999..2}.tar"]
-)
+MANY = [
+    "a/{0..99999999}.tar",
+    "a/{000..999}/{00000..99999}.tar",
+    "{-9999999999999999..9}.tar",
+    "{0..99999999..2}.tar",
+    "s3://b/{0..99999999999999999999}.tar",
+    "s3://b/{0.." + "9" * 5_000 + "}.tar",
+    "s3://b/" + "{a,b}" * 21,
+    "s3://b/" + "{a..z}" * 5,
+    "s3://b/{" + "{a,b}" * 30 + "}",
+]
+
+
+@pytest.mark.parametrize("spec", MANY, ids=range(len(MANY)))
 def test_a_range_of_too_many_shards_is_refused_at_once(spec):
-    with pytest.raises(ValueError, match=r"stands for .* shards, more than 1,000,000"):
+    with pytest.raises(ValueError, match=r"stands for .* shards, more than 1,000,000") as caught:
         expand_urls(spec)
+    assert len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize(
+    ("spec", "count"),
+    [
+        ("{x{0000..1999},y{0000..1999}}.tar", 4_000),
+        ("{a,b{c,d}}-{0..9..3}-{a..c}", 3 * 4 * 3),
+        ("{only}/{}", 1),
+        (r"\{a,b\}{a,b}", 2),
+        ("a,b}{1..2}", None),
+    ],
+)
+def test_what_braces_stand_for_is_known_before_they_are_expanded(spec, count):
+    if count is None:
+        with pytest.raises(ValueError, match="unbalanced braces"):
+            expand_urls("s3://b/" + spec)
+    else:
+        assert len(expand_urls("s3://b/" + spec)) == count == _names_in("s3://b/" + spec)
+
+
+def test_braces_without_end_in_each_other_are_refused():
+    with pytest.raises(ValueError, match="braces in braces, more than 50 deep"):
+        expand_urls("{" * 3_000 + "a,b" + "}" * 3_000)

@@ -6,14 +6,19 @@ import glob
 import math
 import os
 import re
+import reprlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from urllib.parse import urlsplit
 
 import fsspec
 from braceexpand import braceexpand
 
 MOST_SHARDS = 1_000_000  # that one pattern may stand for; more is a slip of the range
-_RANGE = re.compile(r"\{(-?\d{1,18})\.\.(-?\d{1,18})(?:\.\.(-?\d{1,18}))?\}")
+MOST_BRACES_DEEP = 50  # one in another
+LARGEST_NUMBER = 1e15  # in a range
+_NUMBERS = re.compile(r"(-?\d+)\.\.(-?\d+)(?:\.\.-?(\d+))?")
+_LETTERS = re.compile(r"([A-Za-z])\.\.([A-Za-z])(?:\.\.-?\d+)?")
 
 HTTP = ("http", "https")  # the protocols that are spoken here; fsspec speaks the others
 
@@ -84,13 +89,15 @@ def _expand_one(spec: str) -> list[str]:
         raise ValueError("a url is empty; name a tar, a folder of tars, or a pattern")
     if os.path.exists(spec):
         return _local_shards(spec, spec, spec)
-    numbers = math.prod(1 + abs(int(last) - int(first)) // max(1, abs(int(step or 1))) for first, last, step in _RANGE.findall(spec))
+    numbers = _names_in(spec)
     if numbers > MOST_SHARDS:
-        raise ValueError(f"{spec!r} stands for {numbers:,} shards, more than {MOST_SHARDS:,}; check the range of the braces")
+        raise ValueError(
+            f"{reprlib.repr(shown_url(spec))} stands for {numbers:.4g} shards, more than {MOST_SHARDS:,}; check the range of the braces"
+        )
     try:
         names = list(braceexpand(spec))
     except ValueError as error:
-        raise ValueError(f'{spec!r} has unbalanced braces; a range is written as in "shards/{{000..099}}.tar"') from error
+        raise ValueError(f'{shown_url(spec)!r} has unbalanced braces; a range is written as in "shards/{{000..099}}.tar"') from error
     shards = []
     for url in names:
         if url.startswith("pipe:"):
@@ -103,6 +110,46 @@ def _expand_one(spec: str) -> list[str]:
         path = local_path(url)
         shards += _remote_shards(url, spec) if path is None else _local_shards(path, url, spec)
     return shards
+
+
+def _names_in(spec: str) -> float:
+    """At most so many names does a pattern with braces stand for; to be asked before they are made."""
+    open_braces: list[_Brace] = [_Brace(0)]
+    position = 0
+    while position < len(spec):
+        innermost = open_braces[-1]
+        if spec[position] == "\\":
+            position += 1
+        elif spec[position] == "{":
+            open_braces.append(_Brace(position + 1))
+        elif spec[position] == "," and len(open_braces) > 1:
+            innermost.alternatives += innermost.names
+            innermost.names = 1.0
+        elif spec[position] == "}" and len(open_braces) > 1:
+            open_braces.pop()
+            open_braces[-1].names *= _range_length(spec[innermost.start : position]) or innermost.alternatives + innermost.names
+        if len(open_braces) > MOST_BRACES_DEEP:
+            raise ValueError(f"{reprlib.repr(shown_url(spec))} has braces in braces, more than {MOST_BRACES_DEEP} deep")
+        position += 1
+    return open_braces[0].names
+
+
+@dataclass
+class _Brace:
+    """One that is open while a pattern is read."""
+
+    start: int
+    alternatives: float = 0.0  # names that its parts before the last comma stand for
+    names: float = 1.0  # and the part behind it
+
+
+def _range_length(text: str) -> float:
+    """How many a range between braces stands for; 0 for anything else."""
+    numbers, letters = _NUMBERS.fullmatch(text), _LETTERS.fullmatch(text)
+    if numbers is not None:
+        first, last, step = (float(number or 1) for number in numbers.groups())
+        return 1 + abs(last - first) // max(1, step) if max(abs(first), abs(last)) < LARGEST_NUMBER else math.inf
+    return 0 if letters is None else 1 + abs(ord(letters[1]) - ord(letters[2]))
 
 
 def _remote_shards(url: str, spec: str) -> list[str]:
