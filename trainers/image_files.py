@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from io import BytesIO
 from os import PathLike
 from pathlib import Path
@@ -10,6 +9,8 @@ from zipfile import BadZipFile
 
 import cv2
 import numpy as np
+
+from trainers.pfm import parse_pfm
 
 KITTI_DIVISOR = 256  # 16-bit PNG as KITTI and others store it
 ARRAY_SUFFIXES = (".npy", ".npz")
@@ -114,16 +115,10 @@ def _decode_array(path: Path) -> np.ndarray:
 
 def _decode_pfm(path: Path) -> np.ndarray:
     content = _content(path)
-    header = re.match(rb"(P[fF])\s+(\d+)\s+(\d+)\s+([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)[ \t\r]*\n", content)
-    if header is None:
-        raise ValueError(f"{path} does not begin as a PFM file does (Pf, width, height, scale)")
-    kind, width, height, scale = header[1], int(header[2]), int(header[3]), float(header[4])
-    channels = 3 if kind == b"PF" else 1
-    values = content[header.end() :]
-    if len(values) != 4 * width * height * channels:
-        raise ValueError(f"{path} holds {len(values):,} of the {4 * width * height * channels:,} bytes of {width} x {height} values")
-    stored = np.frombuffer(values, "<f4" if scale < 0 else ">f4").reshape(height, width, channels)[::-1]
-    return stored.astype(np.float32) if channels == 3 else stored[..., 0].astype(np.float32)
+    try:
+        return parse_pfm(content)
+    except ValueError as error:
+        raise ValueError(f"{path} {error}") from error
 
 
 def _content(path: Path) -> bytes:

@@ -218,7 +218,7 @@ def test_damaged_files_of_a_pair_are_told_apart(tmp_path):
     files = PUBLISHED["sceneflow-clean"][0]
     truth = "FlyingThings3D/disparity/TRAIN/A/0000/left/0006.pfm"
     cases = {
-        "damaged map: 96 of the 960 bytes of 20 x 12 values": {truth: files[truth][: -(960 - 96)]},
+        "damaged map: it holds 96 of the 960 bytes of 20 x 12 values": {truth: files[truth][: -(960 - 96)]},
         "sizes differ: the disparity is 19 x 12, the left image 20 x 12": {truth: pfm(DISPARITY[:, 1:])},
         "no disparity: the map has no positive value": {truth: pfm(0 * DISPARITY)},
         "empty file": {"FlyingThings3D/frames_cleanpass/TRAIN/A/0000/right/0006.png": b""},

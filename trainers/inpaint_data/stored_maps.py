@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import io
-import re
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
+from trainers.pfm import parse_pfm
 from zsdata.faults import BadPhoto
 
 MAP_EXTENSIONS = ("png", "pfm", "npy")
-_PFM_HEADER = re.compile(rb"Pf\s+(\d{1,6})\s+(\d{1,6})\s+(-?[\d.]+(?:[eE][-+]?\d+)?)[ \t\r]*\n")
 
 
 class StereoFrame(NamedTuple):
@@ -56,15 +55,13 @@ def decode_map(data: bytes, extension: str) -> np.ndarray:
 
 
 def _decode_pfm(data: bytes) -> np.ndarray:
-    header = _PFM_HEADER.match(data)
-    if header is None:
-        raise BadPhoto("damaged map: it does not begin as a PFM file of one channel does (Pf, width, height, scale)")
-    width, height = int(header[1]), int(header[2])
-    values = data[header.end() :]
-    if len(values) != 4 * width * height:
-        raise BadPhoto(f"damaged map: {len(values):,} of the {4 * width * height:,} bytes of {width} x {height} values")
-    little_endian = float(header[3]) < 0
-    return np.frombuffer(values, "<f4" if little_endian else ">f4").reshape(height, width)[::-1].astype(np.float32)
+    try:
+        stored = parse_pfm(data)
+    except ValueError as error:
+        raise BadPhoto(f"damaged map: it {error}") from error
+    if stored.ndim != 2:
+        raise BadPhoto("damaged map: a PFM file of one channel was expected, found one in colour")
+    return stored
 
 
 def _decode_npy(data: bytes) -> np.ndarray:
