@@ -14,6 +14,7 @@ from typing import Any, cast
 import torch
 from accelerate import Accelerator
 from accelerate.tracking import GeneralTracker
+from accelerate.utils import gather_object
 from torch import Tensor
 from tqdm import tqdm
 
@@ -28,6 +29,7 @@ from trainers.validation import BEST_BY, EvaluationSet, Validation
 from trainers.weight_average import WeightAverage, weights_of
 from zsdata import StereoBatch, ZeroStereoStream
 from zsdata.metrics import reconstruction_error
+from zsdata.position import require_one_place
 
 LossFunction = Callable[[Tensor | None, list[Tensor], StereoBatch], tuple[Tensor, dict[str, Any]]]
 
@@ -100,7 +102,7 @@ def train(
             a checkpoint is saved, too, and copied to OUTPUT/best when it is the best so far, see `Validation.is_best`.
         tracker: any of Accelerate's by name, one of your own, or None.
     Raises:
-        ValueError, ImportError, OSError: options, a tracker or a checkpoint that cannot be used.
+        ValueError, ImportError, OSError: options, a tracker or a checkpoint that cannot be used, or a rank that has other photos.
         TrainingDiverged: too many steps in a row had to be skipped.
     """
     with warnings.catch_warnings():
@@ -159,6 +161,7 @@ def train(
         accelerator.print(f"resumed from {checkpoint} at step {step}")
         if validation.best is not None and accelerator.is_main_process:
             run_folder.restore_best(checkpoint, output, validation.best["step"])
+    require_one_place(gather_object([loader.state_dict()]))
     model, optimizer = accelerator.prepare(matcher, optimizer)
     model.train()
     guard = StepGuard(accelerator, matcher, output / "skipped.jsonl")
