@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import os
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,13 @@ from zsdata import AdaptiveDisparity, AugmentConfig, DiffusionNetwork, Synthesis
 from zsdata.faults import NoUsablePhoto, TooManyFaults, WorkerLost
 from zsdata.sources import parse_sources
 from zsdata.stream import DEPTH_PLACEMENTS
+
+HUB_ID = re.compile(r"[\w.-]+(/[\w.-]+)?")  # "builtin" and "stored", too
+
+
+def labels_are_trusted(arguments: argparse.Namespace) -> bool:
+    """Whether every label has confidence 1, so that nothing is left for the photometric term."""
+    return arguments.no_confidence or arguments.depth == "stored"
 
 
 def add_training_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +62,10 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
         help="of the crops, multiples of 32 (default: 384 512)",
     )
     stream.add_argument(
-        "--depth", default="builtin", metavar="NAME", help='"builtin", or a Hub id or folder in the transformers format (default: builtin)'
+        "--depth",
+        default="builtin",
+        metavar="NAME",
+        help='"builtin", "stored" (maps beside the photos in the tars), or a Hub id or folder in the transformers format (default: builtin)',
     )
     stream.add_argument(
         "--inpaint",
@@ -193,6 +205,8 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
 
 def open_stream(arguments: argparse.Namespace) -> ZeroStereoStream:
     """The stream that the arguments describe."""
+    if not os.path.isdir(arguments.depth) and not HUB_ID.fullmatch(arguments.depth):
+        raise ValueError(f'--depth {arguments.depth} is neither "builtin", "stored", a folder that is there, nor a Hub id ("owner/name")')
     schedule: dict[int, Any] = {0: parse_sources(arguments.sources)}
     for epoch, *urls in arguments.sources_from:
         if not epoch.isdigit() or not urls:

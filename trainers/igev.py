@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from trainers.arguments import add_training_arguments, run, train_as_told
+from trainers.arguments import add_training_arguments, labels_are_trusted, run, train_as_told
 from trainers.models.igev_stereo import IGEVStereo
 from trainers.models.mobilenet import load_imagenet_weights
 from trainers.training_loss import TrainingLoss
@@ -57,7 +57,7 @@ def main() -> None:
     matcher = IGEVStereo(**options)
     if arguments.backbone_weights is not None:
         load_imagenet_weights(matcher.feature, arguments.backbone_weights)
-    loss = TrainingLoss(name=arguments.loss, trusted=arguments.no_confidence, max_disparity=arguments.max_supervised_disparity)
+    loss = TrainingLoss(name=arguments.loss, trusted=labels_are_trusted(arguments), max_disparity=arguments.max_supervised_disparity)
     train_as_told(arguments, matcher, loss, "igev_stereo", options)
 
 

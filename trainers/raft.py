@@ -10,7 +10,7 @@ import argparse
 
 import torch
 
-from trainers.arguments import add_training_arguments, run, train_as_told
+from trainers.arguments import add_training_arguments, labels_are_trusted, run, train_as_told
 from trainers.models import load_matcher
 from trainers.models.extractor import NORMS
 from trainers.training_loss import TrainingLoss
@@ -52,7 +52,7 @@ def main() -> None:
     options = {name: getattr(arguments, name) for name in names}
     torch.manual_seed(arguments.seed)  # the fresh weights
     matcher = load_matcher("raft_stereo", **options)
-    loss = TrainingLoss(name=arguments.loss, trusted=arguments.no_confidence)
+    loss = TrainingLoss(name=arguments.loss, trusted=labels_are_trusted(arguments))
     train_as_told(arguments, matcher, loss, "raft_stereo", options)
 
 

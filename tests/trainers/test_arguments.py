@@ -3,7 +3,7 @@ import argparse
 import pytest
 
 from tests.scenes import photo_tar
-from trainers.arguments import add_training_arguments, open_stream
+from trainers.arguments import add_training_arguments, labels_are_trusted, open_stream
 
 pytestmark = pytest.mark.filterwarnings("ignore:The built-in depth")
 
@@ -28,6 +28,11 @@ def test_the_streams_options_reach_the_stream(tar, tmp_path):
     assert len(cached) == 3 and (tmp_path / "depth").is_dir()
 
 
+def test_labels_are_trusted_where_nothing_tells_their_confidence():
+    trusted = [labels_are_trusted(parsed("--sources", "a.tar", *words)) for words in ((), ("--no-confidence",), ("--depth", "stored"))]
+    assert trusted == [False, True, True]
+
+
 def test_a_diffusion_network_takes_its_steps_and_its_subfolder(tar):
     model = ("--inpaint", "Windsrain/ZeroStereo", "--inpaint-subfolder", "StereoGen", "--inpaint-steps", "4")
     record = open_stream(parsed("--sources", tar, *model)).provenance()
@@ -42,6 +47,7 @@ def test_a_diffusion_network_takes_its_steps_and_its_subfolder(tar):
         (("--inpaint-steps", "4"), "belongs to a diffusion network; --inpaint is builtin"),
         (("--depth-resolution", "518"), "depth_resolution belongs to a network"),
         (("--depth", "depth-anything/Depth-Anything-V2-Large-hf", "--commercial-safe"), "no commercial use"),
+        (("--depth", "/no/such/folder"), r"--depth /no/such/folder is neither .* a folder that is there, nor a Hub id"),
         (("--views-per-image", "0"), "views_per_image is an integer, 1 or more"),
     ],
 )
