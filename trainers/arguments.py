@@ -65,7 +65,7 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
         "--depth",
         default="builtin",
         metavar="NAME",
-        help='"builtin", "stored" (maps beside the photos in the tars), or a Hub id or folder in the transformers format (default: builtin)',
+        help='"builtin", "stored" (maps beside the photos in the tars), a Hub id or folder in the transformers format (default: builtin)',
     )
     stream.add_argument(
         "--inpaint",

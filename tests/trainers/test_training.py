@@ -456,6 +456,16 @@ def test_a_wrong_argument_ends_the_program_without_a_traceback(tmp_path):
     assert done.returncode != 0 and "nowhere.tar" in done.stderr and "Traceback" not in done.stderr
 
 
+@pytest.mark.parametrize(("cause", "words"), [(OSError("no such model"), True), (KeyError("a bug"), False)])
+def test_a_model_that_cannot_be_loaded_is_one_line_and_a_bug_is_a_traceback(monkeypatch, cause, words):
+    def main():
+        raise RuntimeError("sample 0 failed") from cause
+
+    monkeypatch.setattr(sys, "argv", ["raft.py"])
+    with pytest.raises(SystemExit if words else RuntimeError, match=r"^raft.py: sample 0 failed$" if words else "sample 0 failed"):
+        run(main)
+
+
 def parsed(*arguments):
     parser = raft.argparse.ArgumentParser()
     add_training_arguments(parser)
