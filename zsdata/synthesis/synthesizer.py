@@ -107,13 +107,13 @@ def _depth_maps(estimate: Tensor, mirrored: Tensor | None) -> DepthMaps:
     """What is known from inverse depth and, in the same frame, that of the mirrored photo."""
     inverse_depth = normalize_inverse_depth(estimate)
     if mirrored is None:
-        confidence, consistency = torch.ones_like(inverse_depth), torch.ones(len(inverse_depth), dtype=torch.float64)
+        confidence = torch.full_like(inverse_depth, CERTAIN, dtype=torch.uint8)
+        consistency = torch.ones(len(inverse_depth), dtype=torch.float64)
     else:
         mirrored = normalize_inverse_depth(mirrored)
-        confidence, consistency = flip_confidence(inverse_depth, mirrored), flip_consistency(inverse_depth, mirrored)
-    return DepthMaps(
-        (inverse_depth * NEAREST).round_().int().to(torch.uint16), (confidence * CERTAIN).round_().int().to(torch.uint8), consistency
-    )
+        confidence = (flip_confidence(inverse_depth, mirrored) * CERTAIN).round_().int().to(torch.uint8)
+        consistency = flip_consistency(inverse_depth, mirrored)
+    return DepthMaps((inverse_depth * NEAREST).round_().int().to(torch.uint16), confidence, consistency)
 
 
 def synthesize(photo_view: Tensor, depth: DepthMaps, view: View, scale: float, config: SynthesisConfig, meter: Meter) -> Synthesized:
