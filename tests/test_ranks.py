@@ -17,9 +17,13 @@ from pathlib import Path
 import pytest
 import torch.distributed as dist
 from accelerate import Accelerator
+from accelerate.state import AcceleratorState
 
 from tests.scenes import grey_fill, layered_depth, photo_tar
 from tests.test_stream import fingerprint, open_stream
+from tests.trainers.test_training import TORCHRUN, arguments_for, config, run_training
+from tests.trainers.test_training import launch as launch_trainer
+from trainers import loop
 from zsdata.faults import FailureBudget
 from zsdata.position import require_one_place
 
@@ -248,3 +252,34 @@ def test_accelerate_saves_on_some_ranks_and_goes_on_with_others(tmp_path, before
     codes, outputs = run_ranks(tmp_path, [(train_under_accelerate, after, free_port(), tar, tmp_path, "checkpoint", 0, 2)] * after)
     assert codes == [0] * after, outputs
     assert in_order(tmp_path, after, 1) == unbroken[12:]
+
+
+TRAINER = """
+import os, sys
+sys.path.insert(0, {root!r})
+from trainers import raft
+
+sys.argv[sys.argv.index("--sources") + 1] += os.environ["RANK"] + ".tar"
+raft.run(raft.main)
+"""
+
+
+@pytest.mark.slow
+def test_a_training_whose_shard_is_cut_on_one_node_names_the_rank_and_ends(tmp_path):
+    script, sources = tmp_path / "script.py", tmp_path / "photos-"
+    script.write_text(TRAINER.format(root=str(Path(__file__).resolve().parents[1])))
+    for rank, count in enumerate((8, 7)):
+        photo_tar(Path(f"{sources}{rank}.tar"), count)
+    arguments = arguments_for(sources, tmp_path / "run", "--steps", 2, "--tracker", "none")
+    start = time.monotonic()
+    run = launch_trainer(arguments, 2, script, TORCHRUN)
+    assert run.returncode != 0 and time.monotonic() - start < LIMIT_SECONDS
+    assert "rank 1 differs from rank 0: its manifest is" in run.stderr
+
+
+def test_a_training_asks_all_ranks_for_their_place_before_its_first_step(tmp_path, monkeypatch):
+    monkeypatch.setattr(loop, "gather_object", lambda own: [*own, {**own[0], "manifest": "other"}])
+    with pytest.raises(ValueError, match="rank 1 differs from rank 0: its manifest is 'other'"):
+        run_training(photo_tar(tmp_path / "photos.tar", 4), tmp_path / "run", config(steps=1))
+    assert not list((tmp_path / "run").glob("*"))
+    AcceleratorState._reset_state(reset_partial_state=True)

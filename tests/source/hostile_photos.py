@@ -172,6 +172,8 @@ def _lying() -> dict[str, Odd]:
         "png chunk of 2^32 bytes": (over(PNG, 33, b"\xff" * 4), "truncated"),
         "webp says 2^24 x 2^24": (over(ANIMATED, canvas, b"\xff" * 6), "too large"),
         "webp says another size": (over(WEBP, bitstream, struct.pack("<HH", 16383, 16383)), "too large"),
+        "webp of no width": (over(WEBP, bitstream, bytes(2)), "damaged: 0 x"),
+        "webp of no width with alpha": (webp(chunk(b"ALPH", bytes(2)) + over(WEBP, bitstream, bytes(2))[12:]), "damaged: 0 x"),
         "webp file of 2^32 bytes": (over(WEBP, 4, b"\xff" * 4), "truncated"),
         "webp file of no bytes": (over(WEBP, 4, b"\0" * 4), "damaged"),
         "webp chunk of 2^32 bytes": (over(WEBP, 16, b"\xff" * 4), "truncated"),

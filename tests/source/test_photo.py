@@ -250,6 +250,18 @@ def test_a_photo_without_pixels_is_refused(kind, width, height):
         decode_rgb(bomb(kind, width, height))
 
 
+@pytest.mark.parametrize("alpha", [b"", b"ALPH\2\0\0\0\0\0"])
+@pytest.mark.parametrize(("width", "height"), [(0, 10), (10, 0), (0, 0)])
+def test_a_webp_without_pixels_is_refused(width, height, alpha):
+    lossy = FILES["webp"][0]
+    at = lossy.index(b"\x9d\x01\x2a") + 3
+    body = alpha + lossy[12:at] + struct.pack("<HH", width, height) + lossy[at + 4 :]
+    data = b"RIFF" + struct.pack("<I", len(body) + 4) + b"WEBP" + body
+    for look in (decode_rgb, probe_size):
+        with pytest.raises(BadPhoto, match=f"damaged: {width} x {height} pixels"):
+            look(data)
+
+
 def tiny(kind):
     return encode(picture(), kind)
 

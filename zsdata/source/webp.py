@@ -96,7 +96,10 @@ def _bitstream_size(chunks: dict[bytes, bytes]) -> tuple[int, int]:
         bits = int.from_bytes(lossless[1:5], "little")
         return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
     if lossy is not None and len(lossy) >= 10 and lossy[3:6] == b"\x9d\x01\x2a":
-        return int.from_bytes(lossy[6:8], "little") & 0x3FFF, int.from_bytes(lossy[8:10], "little") & 0x3FFF
+        width, height = int.from_bytes(lossy[6:8], "little") & 0x3FFF, int.from_bytes(lossy[8:10], "little") & 0x3FFF
+        if not width or not height:
+            raise BadPhoto(f"damaged: {width} x {height} pixels")
+        return width, height
     raise BadPhoto("damaged: a WebP without image data")
 
 
