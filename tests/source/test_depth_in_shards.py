@@ -91,6 +91,7 @@ def test_the_index_changes_nothing_but_the_checksums(tmp_path):
     write_index(shards)
     after = build_manifest(shards)
     assert (after.digest, depths_of(after)) == (before.digest, depths_of(before))
+    assert before.depth_checksums is not None and after.depth_checksums is not None and after.depth_offsets is not None
     assert (before.depth_checksums < 0).all() and np.array_equal(after.depth_checksums >= 0, after.depth_offsets >= 0)
 
 
@@ -179,7 +180,8 @@ def test_an_index_of_the_version_without_maps_is_renewed_and_not_misread(tmp_pat
     assert "no index of version 2" in caplog.text and "`zsdata index` renews them" in caplog.text
     report = write_index(shard)
     assert (report.unchanged, report.files) == (0, [str(path)])
-    assert list(load_listing(shard).depth_sizes) == [1]
+    renewed = load_listing(shard)
+    assert renewed is not None and list(renewed.depth_sizes) == [1]
 
 
 @pytest.mark.parametrize(
@@ -232,6 +234,7 @@ def test_a_changed_byte_of_an_indexed_map_is_found_when_it_is_read_and_by_verify
     write_index(shard)
     assert (verify(shard).depth_maps, verify(shard).problems) == (1, [])
     manifest = build_manifest(shard)
+    assert manifest.depth_offsets is not None
     flip(shard, int(manifest.depth_offsets[0]) + 1000)
     with pytest.raises(BadPhoto, match="stored depth damaged: other bytes than when the shard was indexed"):
         manifest.read_depth(0)

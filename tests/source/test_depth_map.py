@@ -80,9 +80,9 @@ def test_sides_in_whole_patches_fit_and_a_larger_map_does_not(photo, depth):
     data = npy(np.tile(np.arange(width, dtype=np.float16), (height, 1)))
     if depth > photo:
         with pytest.raises(BadPhoto, match=f"^stored depth does not fit: the photo has 640 x 480 .* the depth map {width} x {height}; it"):
-            decode_depth(data, PhotoHeader(*photo, 1))
+            decode_depth(data, PhotoHeader(photo[0], photo[1], 1))
     else:
-        assert decode_depth(data, PhotoHeader(*photo, 1)).shape == photo[::-1]
+        assert decode_depth(data, PhotoHeader(photo[0], photo[1], 1)).shape == photo[::-1]
 
 
 @pytest.mark.parametrize("sides", [(HEIGHT + 1, WIDTH), (HEIGHT, WIDTH + 1), (HEIGHT, WIDTH // 2), (10, 40), (WIDTH, HEIGHT), (1, 1)])
@@ -149,7 +149,7 @@ REFUSED = {
     "complex": (npy(RAMP.astype(np.complex64)), OTHER),
     "three axes": (npy(RAMP[None]), OTHER + "float16, float32, float64 or uint16 [h, w] is needed, this is <f4 [1, 37, 51]"),
     "one axis": (npy(RAMP.ravel()), OTHER),
-    "no axis": (npy(np.float32(1)), OTHER),
+    "no axis": (npy(np.array(1, np.float32)), OTHER),
     "no rows": (npy(RAMP[:0]), DAMAGED + "51 x 0 values"),
     "negative sides": (header_only(shape="(-37, -51)"), OTHER),
     "sides that are no numbers": (header_only(shape="(__import__('os'), 5)"), OTHER),
