@@ -20,7 +20,7 @@ from zsdata.prepared import Draft, Prepared, Rejected, make
 from zsdata.quality import QualityGate
 from zsdata.seeding import rng
 from zsdata.source.depth_map import decode_depth
-from zsdata.source.photo import decode_rgb, probe_photo
+from zsdata.source.photo import PhotoFile, decode_rgb
 from zsdata.source.shard_cache import ShardCache
 from zsdata.sources import Schedule, SourceSet
 from zsdata.synthesis.depth import DepthEstimator, DepthNetwork, as_network, load_depth
@@ -61,7 +61,8 @@ class _Photo:
     def __init__(self, data: bytes, stored_depth: bytes | None) -> None:
         self.data = data
         self.stored_depth = stored_depth
-        self.header = probe_photo(data)
+        self._file = PhotoFile(data)
+        self.header = self._file.header
         width, height, _ = self.header
         if min(width, height) < SHORTEST_SIDE_PX:
             raise BadPhoto(f"too small: a side shorter than {SHORTEST_SIDE_PX} px: {width}x{height}")
@@ -72,7 +73,7 @@ class _Photo:
     def pixels(self, reduction: int = 1) -> np.ndarray:
         """uint8 [H, W, 3], RGB; a JPEG at one part in `reduction` of each side."""
         if reduction not in self._pixels:
-            self._pixels[reduction] = decode_rgb(self.data, reduction)
+            self._pixels[reduction] = self._file.decode(reduction)
         return self._pixels[reduction]
 
 

@@ -148,6 +148,18 @@ def test_a_changed_byte_is_found_when_a_photo_is_read_and_by_verify(tmp_path):
     assert manifest.read(0) and manifest.read(2)
 
 
+def test_an_indexed_photo_that_no_longer_decodes_is_one_problem(tmp_path):
+    shard = photo_tar(tmp_path / "a.tar", count=3)
+    write_index(shard)
+    _, key, offset, size = build_manifest(shard).member(1)
+    with open(shard, "r+b") as file:
+        file.seek(offset)
+        file.write(bytes(size))
+    report = verify(shard)
+    assert [(problem.key, problem.reason) for problem in report.problems] == [(key, "only zeros")]
+    assert report.photos == 2
+
+
 def test_verify_misses_what_the_index_lists_and_names_what_it_does_not(tmp_path):
     photos = {key: jpeg(photo(number)) for number, key in enumerate("abc")}
     shard = write_tar(tmp_path / "a.tar", {f"{key}.jpg": data for key, data in photos.items()})

@@ -14,7 +14,7 @@ from zsdata.source.archive import read_shard
 from zsdata.source.index import write_index
 from zsdata.source.manifest import build_manifest
 from zsdata.source.pack import pack
-from zsdata.source.photo import decode_rgb
+from zsdata.source.photo import PhotoFile, decode_rgb
 
 from .images import encode, picture
 
@@ -160,9 +160,9 @@ def test_a_pack_that_fails_leaves_nothing_behind(photos, tmp_path, monkeypatch):
         seen.append(1)
         if len(seen) == 3:
             raise KeyboardInterrupt
-        return decode_rgb(data)
+        return PhotoFile(data)
 
-    monkeypatch.setattr("zsdata.source.pack.decode_rgb", fail)
+    monkeypatch.setattr("zsdata.source.pack.PhotoFile", fail)
     with pytest.raises(KeyboardInterrupt):
         pack(photos, output, photos_per_shard=1, overwrite=True)
     assert [path.name for path in output.iterdir()] == ["photos-000000.tar"]

@@ -13,7 +13,7 @@ from PIL import Image
 
 from zsdata.faults import BadPhoto
 from zsdata.source import jpeg, opencv
-from zsdata.source.photo import MAX_PIXELS, decode_photo, decode_rgb, photo_extension, probe_size
+from zsdata.source.photo import MAX_PIXELS, PhotoFile, decode_photo, decode_rgb, probe_size
 
 from .images import encode, exif, over_white, picture, png, png_chunk
 
@@ -284,7 +284,7 @@ def tiny(kind):
     ],
 )
 def test_other_files_are_refused_by_name(data, reason):
-    for look in (decode_photo, probe_size, photo_extension):
+    for look in (decode_photo, probe_size, PhotoFile):
         with pytest.raises(BadPhoto) as caught:
             look(data)
         assert caught.value.reason == reason
@@ -303,7 +303,7 @@ def test_anything_but_bytes_is_an_error():
 
 
 def test_the_extension_is_that_of_the_content():
-    assert [photo_extension(FILES[kind][0]) for kind in ("jpeg", "png", "webp")] == ["jpg", "png", "webp"]
+    assert [PhotoFile(FILES[kind][0]).extension for kind in ("jpeg", "png", "webp")] == ["jpg", "png", "webp"]
 
 
 def test_decoding_looks_at_the_picture_once(monkeypatch):

@@ -16,7 +16,7 @@ from zsdata.faults import BadPhoto
 from zsdata.source.archive import DEPTH_EXTENSIONS, MAX_PHOTO_BYTES, OTHER_IMAGE_EXTENSIONS, PHOTO_EXTENSIONS
 from zsdata.source.depth_map import DepthMap, decode_depth
 from zsdata.source.index import INDEX_ENDING
-from zsdata.source.photo import decode_rgb, photo_extension, probe_photo
+from zsdata.source.photo import PhotoFile, probe_photo
 
 _BLOCK = 512
 _DEPTH_FILE = re.compile(rf"(.+)\.({'|'.join(map(re.escape, DEPTH_EXTENSIONS))})", re.IGNORECASE | re.DOTALL)
@@ -216,8 +216,9 @@ def _files(source: Path, output: Path, ancestors: tuple[str, ...] = (), below: s
 def _read_photo(path: Path) -> tuple[bytes, str]:
     """A photo's bytes and the extension that fits them; BadPhoto if zsdata cannot use it."""
     data = _read_file(path)
-    decode_rgb(data)
-    return data, photo_extension(data)
+    photo = PhotoFile(data)
+    photo.decode()
+    return data, photo.extension
 
 
 def _read_file(path: Path) -> bytes:

@@ -69,46 +69,60 @@ def decode_photo(data: bytes) -> Tensor:
 
 
 def decode_rgb(data: bytes, reduction: int = 1) -> np.ndarray:
-    """As `decode_photo`, to uint8 [H, W, 3].
+    """As `decode_photo`, to uint8 [H, W, 3]; see `PhotoFile.decode`."""
+    return PhotoFile(data).decode(reduction)
 
-    Args:
-        reduction: 1, 2, 4 or 8: a JPEG is decoded at one part in so many of each side, rounded up, in less time; other formats are not.
+
+class PhotoFile:
+    """A photo whose structure has been checked and whose size is known, not yet decoded.
+
+    Attributes:
+        header: the size of what `decode` returns, and how the file is turned.
+        extension: the usual one: "jpg", "png" or "webp".
+
+    Raises:
+        BadPhoto: as `decode_photo`, as far as it can know; whether the memory suffices depends on the reduction.
     """
-    photo = _open(data)
-    if isinstance(photo, Jpeg):
-        _check_memory(photo, reduction)
-        image = photo.decode(reduction)
-    else:
-        reduction = 1
-        _check_memory(photo, reduction)
-        image = photo.decode()
-    if image.shape != (-(-photo.height // reduction), -(-photo.width // reduction), 3):
-        raise BadPhoto(
-            f"damaged: {image.shape[1]} x {image.shape[0]} pixels where the header says {photo.width} x {photo.height}"
-            + (f", at one part in {reduction}" if reduction > 1 else "")
-        )
-    return make_upright(image, photo.orientation)
+
+    def __init__(self, data: bytes) -> None:
+        self._photo = photo = _open(data)
+        self.extension = photo.extension
+        width, height = (photo.height, photo.width) if photo.orientation >= 5 else (photo.width, photo.height)
+        self.header = PhotoHeader(width, height, photo.orientation)
+
+    def decode(self, reduction: int = 1) -> np.ndarray:
+        """uint8 [H, W, 3], RGB, as it is meant to be seen.
+
+        Args:
+            reduction: 1, 2, 4 or 8: a JPEG is decoded at one part in so many of each side, rounded up, in less time; other formats are not.
+
+        Raises:
+            BadPhoto: as `decode_photo`.
+        """
+        photo = self._photo
+        if isinstance(photo, Jpeg):
+            _check_memory(photo, reduction)
+            image = photo.decode(reduction)
+        else:
+            reduction = 1
+            _check_memory(photo, reduction)
+            image = photo.decode()
+        if image.shape != (-(-photo.height // reduction), -(-photo.width // reduction), 3):
+            raise BadPhoto(
+                f"damaged: {image.shape[1]} x {image.shape[0]} pixels where the header says {photo.width} x {photo.height}"
+                + (f", at one part in {reduction}" if reduction > 1 else "")
+            )
+        return make_upright(image, photo.orientation)
 
 
 def probe_photo(data: bytes) -> PhotoHeader:
-    """The size of what `decode_photo` would return, and how the file is turned, without decoding.
-
-    Raises:
-        BadPhoto: as far as it can know; whether the memory suffices depends on the reduction.
-    """
-    photo = _open(data)
-    width, height = (photo.height, photo.width) if photo.orientation >= 5 else (photo.width, photo.height)
-    return PhotoHeader(width, height, photo.orientation)
+    """The header of a photo, without decoding it; raises as `PhotoFile`."""
+    return PhotoFile(data).header
 
 
 def probe_size(data: bytes) -> tuple[int, int]:
     """Width and height in pixels of what `decode_photo` would return; as `probe_photo`."""
     return probe_photo(data)[:2]
-
-
-def photo_extension(data: bytes) -> str:
-    """The usual extension for what these bytes are: "jpg", "png" or "webp"; raises BadPhoto as `probe_size` does."""
-    return _open(data).extension
 
 
 def _open(data: bytes) -> Jpeg | Png | WebP:

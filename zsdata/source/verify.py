@@ -13,7 +13,7 @@ from zsdata.faults import BadPhoto, BadShard
 from zsdata.source.archive import DepthMember, Problem, photo_members
 from zsdata.source.depth_map import DepthMap, misfit
 from zsdata.source.index import CHANGED_BYTES, CHANGED_DEPTH, NO_DEPTH, StaleIndex, load_listing
-from zsdata.source.photo import PhotoHeader, decode_rgb, probe_photo
+from zsdata.source.photo import PhotoFile, PhotoHeader
 from zsdata.source.ranges import ShardFile
 from zsdata.source.urls import base_name, expand_urls, shown_url
 
@@ -75,12 +75,15 @@ def verify(
                     headers: dict[str, PhotoHeader] = {}
                     for key, offset, size in photo_members(file, add, on_depth=depths.look_at):
                         data = file.read_at(offset, size)
-                        reason = _reason_against(data, shortest_side_px) or indexed.reason_against(key, data)
-                        if reason is None:
-                            headers[key] = probe_photo(data)
+                        changed = indexed.reason_against(key, data)
+                        try:
+                            header = _header_of_decodable(data, shortest_side_px)
+                            if changed is not None:
+                                raise BadPhoto(changed)
+                            headers[key] = header
                             report.photos += 1
-                        else:
-                            add(Problem(shown, key, offset, reason))
+                        except BadPhoto as fault:
+                            add(Problem(shown, key, offset, fault.reason))
                         bar.update()
                     for key, depth in depths.of(headers):
                         changed = indexed.reason_against_depth(key, depth.checksum)
@@ -183,12 +186,11 @@ class _Indexed:
                 self._add(Problem(self._url, key, offset, "depth map lost: it was there when the shard was indexed"))
 
 
-def _reason_against(data: bytes, shortest_side_px: int) -> str | None:
-    """Why this photo cannot be used; None where it can."""
-    try:
-        height, width, _ = decode_rgb(data).shape
-    except BadPhoto as fault:
-        return fault.reason
-    if min(height, width) < shortest_side_px:
-        return f"too small: a side shorter than {shortest_side_px} px: {width}x{height}"
-    return None
+def _header_of_decodable(data: bytes, shortest_side_px: int) -> PhotoHeader:
+    """What the header of a photo says; BadPhoto where the photo cannot be used."""
+    photo = PhotoFile(data)
+    photo.decode()
+    width, height, _ = photo.header
+    if min(width, height) < shortest_side_px:
+        raise BadPhoto(f"too small: a side shorter than {shortest_side_px} px: {width}x{height}")
+    return photo.header
