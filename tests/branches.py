@@ -30,6 +30,10 @@ class Branches:
         self._before: dict[FrameType, int] = {}
         self.taken: dict[str, set[tuple[str, int, int]]] = defaultdict(set)
 
+    def pytest_runtest_setup(self) -> None:
+        """Once more for every test: others set traces too, and leave none behind."""
+        sys.settrace(self.trace)
+
     def trace(self, frame: FrameType, event: str, argument: Any) -> Any:
         if frame.f_code.co_filename not in self._files:
             return None
@@ -99,7 +103,7 @@ def main(arguments: list[str]) -> int:
     branches = Branches(files)
     threading.settrace(branches.trace)
     sys.settrace(branches.trace)
-    status = pytest.main(["-p", "no:cacheprovider", *arguments[cut + 1 :]])
+    status = pytest.main(["-p", "no:cacheprovider", *arguments[cut + 1 :]], plugins=[branches])
     sys.settrace(None)
     for path in files:
         sys.stdout.write(report(path, branches.taken[path]) + "\n")

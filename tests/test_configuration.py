@@ -1,12 +1,19 @@
 """Whatever a stranger hands to the stream or its loader: it works, or one error says at once what is wrong."""
 
+from dataclasses import fields
+
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.scenes import photo_tar
 from tests.test_stream import open_stream
-from zsdata import AdaptiveDisparity, ImageSource, UniformDisparity
+from zsdata import AdaptiveDisparity, AugmentConfig, DepthNetwork, DiffusionNetwork, ImageSource, UniformDisparity
+from zsdata.faults import FailureBudget
+from zsdata.quality import QualityGate
+from zsdata.sources import parse_sources
+from zsdata.synthesis.synthesizer import SynthesisConfig
+from zsdata.synthesis.view import ViewConfig
 
 odd = st.one_of(
     st.none(),
@@ -66,3 +73,71 @@ def test_loader_options_work_or_are_refused_by_name(tar, options):
 def test_sources_that_are_none_are_refused(sources):
     with pytest.raises((ValueError, TypeError, FileNotFoundError)):
         open_stream(sources)
+
+
+CONFIGURATIONS = [
+    ViewConfig,
+    SynthesisConfig,
+    AugmentConfig,
+    QualityGate,
+    FailureBudget,
+    AdaptiveDisparity,
+    UniformDisparity,
+    DepthNetwork,
+    DiffusionNetwork,
+]
+
+
+@pytest.mark.parametrize("configuration", CONFIGURATIONS)
+@given(data=st.data())
+@thorough
+def test_each_field_of_a_configuration_takes_a_value_or_refuses_it_by_name(configuration, data):
+    name = data.draw(st.sampled_from([field.name for field in fields(configuration) if field.init]))
+    value = data.draw(odd | st.floats(-1, 2) | st.tuples(st.floats(-1, 2), st.floats(-1, 2)))
+    needed = {"name": "folder"} if "name" in [field.name for field in fields(configuration)] else {}
+    try:
+        configuration(**{**needed, name: value})
+    except (ValueError, TypeError) as error:
+        assert any(word in str(error) for word in (name, *name.split("_"))), str(error)
+
+
+specs = st.lists(st.text(alphabet="ab=@:/.0{}1 ", max_size=8) | st.sampled_from(["in=a.tar@0.5", "in=a.tar", "a.tar"]), max_size=3)
+
+
+@given(specs=specs)
+@thorough
+def test_sources_of_a_command_line_are_parsed_or_refused_with_what_they_are(specs):
+    try:
+        parsed = parse_sources(specs)
+    except ValueError as error:
+        assert any(repr(spec) in str(error) for spec in specs)
+    else:
+        assert parsed == specs or (isinstance(parsed, dict) and len(parsed) == len(specs))
+
+
+@given(
+    epochs=st.dictionaries(st.integers(-2, 3) | st.sampled_from(["a", None, 1.5]), st.none(), max_size=3),
+    swap=odd,
+    epoch=st.integers(-2, 3),
+)
+@thorough
+def test_schedules_begin_with_epoch_0_and_are_swapped_later(tar, epochs, swap, epoch):
+    schedule = dict.fromkeys(epochs, tar)
+    named, numbered = all(isinstance(key, str) for key in schedule), all(isinstance(key, int) for key in schedule)
+    if not schedule or not (named or (numbered and min(schedule) == 0)):
+        with pytest.raises((ValueError, TypeError), match="source"):
+            open_stream(schedule)
+        return
+    stream = open_stream(schedule)
+    before = stream.state_dict()
+    with pytest.raises((ValueError, TypeError, FileNotFoundError)):
+        stream.set_sources(swap if epoch > 0 else tar, epoch=epoch)
+    with pytest.raises(ValueError, match="a schedule"):
+        stream.set_sources({1: tar}, epoch=1)
+    assert stream.state_dict() == before
+    if epoch < 0:
+        with pytest.raises(ValueError, match="an epoch is 0 or more"):
+            stream.set_epoch(epoch)
+    else:
+        stream.set_epoch(epoch)
+        assert stream.state_dict()["epoch"] == epoch

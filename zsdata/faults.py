@@ -8,6 +8,8 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from zsdata.field_types import check_types
+
 logger = logging.getLogger("zsdata")
 
 
@@ -67,6 +69,7 @@ class FailureBudget:
     rate: float = 0.1
 
     def __post_init__(self) -> None:
+        check_types(self)
         if self.count < 0 or not 0 <= self.rate <= 1:
             raise ValueError(f"a budget is a count >= 0 and a rate in 0..1; got {self.count} and {self.rate}")
 

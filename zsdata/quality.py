@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from zsdata.field_types import check_types
 from zsdata.synthesis.disparity import SMALLEST_DISPARITY_PX
 
 
@@ -30,6 +31,7 @@ class QualityGate:
     min_flip_consistency: float = 0.7
 
     def __post_init__(self) -> None:
+        check_types(self)
         for name in ("max_hole_share", "min_visible_share", "min_depth_range", "min_flip_consistency"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is a share in 0..1; got {getattr(self, name)}")

@@ -83,3 +83,12 @@ def test_photos_with_a_side_too_short_are_problems_where_a_limit_is_given(tmp_pa
 def test_nothing_is_verified_where_nothing_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"missing\.tar"):
         verify(tmp_path / "missing.tar")
+
+
+def test_the_progress_bar_is_on_stderr_when_asked_for(tmp_path, capsys):
+    shards = [photo_tar(tmp_path / f"{number}.tar", count=2) for number in range(2)]
+    verify(shards, progress=True)
+    out, err = capsys.readouterr()
+    assert not out and "verifying" in err and "shard 2 of 2: 1.tar" in err
+    verify(shards, progress=False)
+    assert capsys.readouterr() == ("", "")

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from zsdata.field_types import check_types
 from zsdata.synthesis.indices import flat_indices, indices_above
 
 SMALLEST_DISPARITY_PX = 0.01  # of the farthest point; not 0, which marks "no value" in most stereo data sets
@@ -33,13 +34,14 @@ class AdaptiveDisparity:
     large_probability: float = 0.1
 
     def __post_init__(self) -> None:
+        check_types(self)
         if not (self.radius > 0 and self.center - 2 * self.radius >= 0 and self.center + 2 * self.radius <= 1):
             raise ValueError(
                 f"center - 2 radius .. center + 2 radius are shares of the width, within 0..1; got {self.center} and {self.radius}"
             )
         probabilities = (self.center_probability, self.small_probability, self.large_probability)
         if min(probabilities) < 0 or abs(sum(probabilities) - 1) > 1e-6:
-            raise ValueError(f"the three probabilities must be >= 0 and add up to 1; got {probabilities}")
+            raise ValueError(f"center_probability, small_probability, large_probability are 0 or more and add up to 1; got {probabilities}")
 
     def draw_scale(self, generator: np.random.Generator, width: int) -> float:
         """The disparity of the nearest point as a share of `width`; in (c - 2 r, c + 2 r)."""
@@ -63,6 +65,7 @@ class UniformDisparity:
     max_px: float = 225.0
 
     def __post_init__(self) -> None:
+        check_types(self)
         if not 0 < self.min_px <= self.max_px:
             raise ValueError(f"a range of pixels needs 0 < min_px <= max_px; got {self.min_px}..{self.max_px}")
 

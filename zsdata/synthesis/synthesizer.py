@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from zsdata.field_types import check_types
 from zsdata.meter import Meter
 from zsdata.synthesis.confidence import flip_confidence, flip_consistency, normalize_inverse_depth
 from zsdata.synthesis.depth import DepthEstimator
@@ -63,6 +64,7 @@ class SynthesisConfig:
     flip_confidence: bool = True  # TCG; without it every label has confidence 1 and the mirrored photo needs no depth
 
     def __post_init__(self) -> None:
+        check_types(self)
         if self.dilate_px < 0:
             raise ValueError(f"dilate_px is 0 or more; got {self.dilate_px}")
 

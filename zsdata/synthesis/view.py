@@ -12,6 +12,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from zsdata.field_types import check_types
+
 
 @dataclass(frozen=True, kw_only=True)
 class ViewConfig:
@@ -24,6 +26,7 @@ class ViewConfig:
     mirror_probability: float = 0.5
 
     def __post_init__(self) -> None:
+        check_types(self)
         if not -4 <= self.min_scale <= self.max_scale <= 4:
             raise ValueError(f"scales are exponents of two, -4 <= min_scale <= max_scale <= 4; got {self.min_scale}..{self.max_scale}")
         if not 0 <= self.max_stretch <= 2:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from zsdata.field_types import check_types
 from zsdata.synthesis.precision import check_dtype
 
 STORED = "stored"  # the name of depth that lies beside the photos and is read with them
@@ -39,6 +40,7 @@ class DepthNetwork:
     micro_batch: int = 8
 
     def __post_init__(self) -> None:
+        check_types(self)
         in_pixels = isinstance(self.resolution, int) and not isinstance(self.resolution, bool) and self.resolution >= 1
         if not (self.resolution is None or self.resolution == "native" or in_pixels):
             raise ValueError(f'resolution is the short side in pixels, "native" or None; got {self.resolution!r}')

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from zsdata.field_types import check_types
 from zsdata.synthesis.precision import check_dtype
 
 COMPILE_MODES = ("default", "reduce-overhead", "max-autotune", "max-autotune-no-cudagraphs")
@@ -46,6 +47,7 @@ class DiffusionNetwork:
     memory_gib: float | None = None
 
     def __post_init__(self) -> None:
+        check_types(self)
         if self.steps < 1:
             raise ValueError(f"steps is 1 or more; got {self.steps}")
         if self.micro_batch != "auto" and (isinstance(self.micro_batch, str) or self.micro_batch < 1):
