@@ -54,6 +54,13 @@ def test_the_resolution_reaches_the_network(folder, tar):
         ZeroStereoStream(tar, depth=layered_depth, depth_resolution=42)
 
 
+def test_a_network_that_is_nowhere_is_an_error_at_once_and_in_words(tar, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r'depth="/no/such" is neither "builtin", "stored", a folder that is there, nor a Hub id'):
+        ZeroStereoStream(tar, depth="/no/such")
+    with pytest.raises((OSError, ValueError), match=r'depth=".*" cannot be loaded'):
+        ZeroStereoStream(tar, depth=tmp_path)
+
+
 def test_auto_keeps_depth_in_the_workers_where_the_loader_has_no_gpu(folder, tar):
     with ZeroStereoStream(tar, size=SIZE, depth=folder).loader(3, num_workers=1) as loader:
         next(iter(loader))
@@ -84,6 +91,6 @@ def test_provenance_names_the_models_with_their_licences(folder, tar):
 def test_a_commercial_user_is_kept_from_non_commercial_models(tar, argument):
     model = {"depth": "depth-anything/Depth-Anything-V2-Large-hf", "inpaint": "stabilityai/sd-turbo"}[argument]
     options = {"depth": layered_depth, argument: model}
-    ZeroStereoStream(tar, **options)
+    ZeroStereoStream(tar, depth=layered_depth, commercial_safe=True)
     with pytest.raises(NonCommercialModel, match=r"commercial_safe is set\. Take "):
         ZeroStereoStream(tar, commercial_safe=True, **options)

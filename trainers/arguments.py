@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
-import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -24,8 +22,6 @@ from zsdata import AdaptiveDisparity, AugmentConfig, DiffusionNetwork, Synthesis
 from zsdata.faults import NoUsablePhoto, TooManyFaults, WorkerLost
 from zsdata.sources import parse_sources
 from zsdata.stream import DEPTH_PLACEMENTS
-
-HUB_ID = re.compile(r"[\w.-]+(/[\w.-]+)?")  # "builtin" and "stored", too
 
 
 def labels_are_trusted(arguments: argparse.Namespace) -> bool:
@@ -205,8 +201,6 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
 
 def open_stream(arguments: argparse.Namespace) -> ZeroStereoStream:
     """The stream that the arguments describe."""
-    if not os.path.isdir(arguments.depth) and not HUB_ID.fullmatch(arguments.depth):
-        raise ValueError(f'--depth {arguments.depth} is neither "builtin", "stored", a folder that is there, nor a Hub id ("owner/name")')
     schedule: dict[int, Any] = {0: parse_sources(arguments.sources)}
     for epoch, *urls in arguments.sources_from:
         if not epoch.isdigit() or not urls:

@@ -119,7 +119,9 @@ def _parser() -> argparse.ArgumentParser:
     data = parser.add_argument_group("the examples")
     data.add_argument("--photos", nargs="+", default=[], metavar="URL", help='tars of photos: paths, urls or patterns ("shards/*.tar")')
     data.add_argument(
-        "--depth", default="builtin", help='for photos: "builtin", or a Hub id or folder in the transformers format (default: builtin)'
+        "--depth",
+        default="builtin",
+        help='for photos: "builtin", a Hub id or folder in the transformers format, or "stored", the maps beside them (default: builtin)',
     )
     data.add_argument("--datasets", nargs="+", default=[], metavar="KIND=FOLDER", help="synthetic stereo, see above")
     data.add_argument(

@@ -121,7 +121,7 @@ class Schedule:
         manifests = tuple(self._manifest(source.urls) for source in named.values())
         if self._stored_depth:
             for name, manifest in zip(named, manifests, strict=True):
-                _check_depth(name, manifest)
+                check_depth_maps(name, manifest)
         sizes = tuple(len(manifest) for manifest in manifests)
         if self._epoch_size is None and any(source.weight is not None for source in named.values()):
             logger.warning("without epoch_size an epoch is one pass over the photos and the sources' weights change nothing; set it")
@@ -137,7 +137,7 @@ class Schedule:
         return self._manifests[key]
 
 
-def _check_depth(name: str, manifest: Manifest) -> None:
+def check_depth_maps(name: str, manifest: Manifest) -> None:
     """Refuses a source without depth maps, and says so of one where some are missing."""
     photos, missing = len(manifest), len(manifest) - manifest.depth_maps
     if missing == photos:

@@ -32,6 +32,7 @@ from zsdata.synthesis.depth.builtin import warn_once
 from zsdata.synthesis.depth.cache import DepthCache
 from zsdata.synthesis.depth.identity import depth_identity
 from zsdata.synthesis.depth.options import STORED
+from zsdata.synthesis.depth.pretrained import load_preprocessing
 from zsdata.synthesis.disparity import AdaptiveDisparity, UniformDisparity
 from zsdata.synthesis.inpaint import DiffusionNetwork, Inpainter, load_inpainter
 from zsdata.synthesis.synthesizer import SynthesisConfig
@@ -90,6 +91,7 @@ class ZeroStereoStream(IterableDataset):
 
     Raises:
         ValueError, TypeError, FileNotFoundError: at once, for an argument that cannot work.
+        ImportError, OSError: the packages for a depth network are not installed, or nothing is found under its name.
     """
 
     def __init__(
@@ -153,12 +155,14 @@ class ZeroStereoStream(IterableDataset):
         if commercial_safe:
             require_commercial(depth, "depth")
             require_commercial(self._inpaint, "inpaint")
+        network = as_network(depth)
         synthesis = synthesis if synthesis is not None else SynthesisConfig()
         self._recipe = Recipe(
             seed=seed,
             size=None if size is None else (int(size[0]), int(size[1])),
             schedule=self._schedule,
             depth=depth,
+            preprocessing=None if network is None else load_preprocessing(network),
             depth_cache=_open_cache(depth_cache, depth_cache_bytes, depth, synthesis),
             disparity=disparity if disparity is not None else AdaptiveDisparity(),
             view=view if view is not None else ViewConfig(),

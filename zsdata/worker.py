@@ -23,11 +23,10 @@ from zsdata.source.depth_map import decode_depth
 from zsdata.source.photo import PhotoFile, decode_rgb
 from zsdata.source.shard_cache import ShardCache
 from zsdata.sources import Schedule, SourceSet
-from zsdata.synthesis.depth import DepthEstimator, DepthNetwork, as_network, load_depth
+from zsdata.synthesis.depth import DepthEstimator, DepthNetwork, load_depth
 from zsdata.synthesis.depth.cache import DepthCache, photo_digest
 from zsdata.synthesis.depth.options import STORED
 from zsdata.synthesis.depth.preprocessing import Preprocessing
-from zsdata.synthesis.depth.pretrained import load_preprocessing
 from zsdata.synthesis.disparity import AdaptiveDisparity, UniformDisparity
 from zsdata.synthesis.synthesizer import INPAINT_CONTEXT_PX, DepthMaps, SynthesisConfig, estimate_depth, given_depth
 from zsdata.synthesis.view import ViewConfig, draw_view, view_photo, whole_view
@@ -44,6 +43,7 @@ class Recipe:
     size: tuple[int, int] | None  # None: each photo whole, at its own size
     schedule: Schedule
     depth: str | DepthNetwork | DepthEstimator
+    preprocessing: Preprocessing | None  # of a depth network
     depth_cache: DepthCache | None
     disparity: AdaptiveDisparity | UniformDisparity
     view: ViewConfig
@@ -84,7 +84,6 @@ class Worker:
         self._recipe = recipe
         self._depth: DepthEstimator | None = None
         self._last: tuple[tuple[str, int], _Photo] | None = None  # the photo whose next view comes next
-        self._preprocessing: Preprocessing | None = None
         self._last_pair: tuple[tuple[SourceSet, int, int], Prepared | Draft] | None = None
 
     def prepare(self, epoch: int, index: int) -> Prepared | Draft:
@@ -191,12 +190,7 @@ class Worker:
 
     def _for_the_device(self, photo: _Photo) -> Tensor:
         pixels = _planes(photo.pixels()).unsqueeze(0)
-        network = as_network(self._recipe.depth)
-        if network is None:
-            return pixels
-        if self._preprocessing is None:
-            self._preprocessing = load_preprocessing(network)
-        return self._preprocessing.prepare(pixels)
+        return pixels if self._recipe.preprocessing is None else self._recipe.preprocessing.prepare(pixels)
 
     def _open(self, sources: SourceSet, choice: Choice, meter: Meter) -> _Photo:
         manifest = sources.manifests[choice.source]

@@ -1,3 +1,4 @@
+import io
 from functools import partial
 
 import numpy as np
@@ -12,6 +13,7 @@ from zsdata.augment import AugmentConfig
 from zsdata.faults import BadPhoto, NoUsablePhoto
 from zsdata.seeding import rng
 from zsdata.source.manifest import build_manifest
+from zsdata.source.photo import decode_rgb
 from zsdata.synthesis.disparity import AdaptiveDisparity
 from zsdata.synthesis.warp import forward_warp
 
@@ -250,6 +252,36 @@ def test_a_photo_that_shows_no_scene_is_refused(tmp_path):
     examples = Examples({"photos": PhotoSource(build_manifest(tar), layered_depth, AdaptiveDisparity())}, (32, 48), 0, 1)
     with pytest.raises(NoUsablePhoto, match="too small"):
         examples[0, 0]
+
+
+def test_depth_stored_beside_the_photos_gives_the_examples_of_the_estimator_that_made_it(tmp_path):
+    photos = {f"{number}.jpg": jpeg(photo(number, 48, 64)) for number in range(3)}
+    maps = {}
+    for name, data in photos.items():
+        image = torch.from_numpy(decode_rgb(data)).permute(2, 0, 1)[None].float()
+        stored = io.BytesIO()
+        np.save(stored, layered_depth(image)[0, 0].numpy())
+        maps[name.replace("jpg", "depth.npy")] = stored.getvalue()
+
+    def made(depth, members):
+        source = PhotoSource(build_manifest(write_tar(tmp_path / "a.tar", members)), depth, AdaptiveDisparity())
+        examples = Examples({"photos": source}, (32, 48), 0, 4)
+        return [examples[0, number] for number in range(4)]
+
+    for one, other in zip(made("stored", photos | maps), made(layered_depth, photos), strict=True):
+        assert torch.equal(one.warped, other.warped) and torch.equal(one.inpaint_mask, other.inpaint_mask)
+    maps.pop("1.depth.npy")
+    assert {reject[2:] for example in made("stored", photos | maps) for reject in example.rejected} == {
+        ("1", "no stored depth: neither 1.depth.npy nor 1.depth.png; add one, or let depth be estimated")
+    }
+    with pytest.raises(ValueError, match="not one of the 3 photos"):
+        made("stored", photos)
+
+
+def test_a_depth_network_that_is_nowhere_is_named_at_once(tmp_path):
+    manifest = build_manifest(photo_tar(tmp_path / "a.tar", 1))
+    with pytest.raises(FileNotFoundError, match='depth="/no/such" is neither'):
+        PhotoSource(manifest, "/no/such", AdaptiveDisparity())
 
 
 def test_an_error_names_its_example(tmp_path):

@@ -20,11 +20,15 @@ from zsdata.faults import BadPhoto, BadShard, NoUsablePhoto
 from zsdata.plan import Choice, EpochPlan
 from zsdata.position import Position
 from zsdata.seeding import rng
+from zsdata.source.depth_map import decode_depth
 from zsdata.source.manifest import Manifest
-from zsdata.source.photo import decode_rgb
+from zsdata.source.photo import PhotoFile
+from zsdata.sources import check_depth_maps
 from zsdata.synthesis.confidence import normalize_inverse_depth
-from zsdata.synthesis.depth import DepthEstimator, load_depth
+from zsdata.synthesis.depth import DepthEstimator, as_network, load_depth
 from zsdata.synthesis.depth.builtin import warn_once
+from zsdata.synthesis.depth.options import STORED
+from zsdata.synthesis.depth.pretrained import load_preprocessing
 from zsdata.synthesis.disparity import AdaptiveDisparity
 from zsdata.worker import MOST_SPARES, SHORTEST_SIDE_PX, single_thread
 
@@ -71,14 +75,23 @@ class PhotoSource:
 
     Args:
         manifest: of the tars that hold the photos.
-        depth: as `load_depth` takes it.
+        depth: as `load_depth` takes it; or "stored", the maps beside the photos.
         scale: draws how far apart the cameras stand.
+
+    Raises:
+        ValueError: "stored", and no photo has a map.
+        ImportError, OSError, ValueError: a network that cannot be loaded.
     """
 
     def __init__(self, manifest: Manifest, depth: str | DepthEstimator, scale: AdaptiveDisparity) -> None:
         self._manifest, self._name, self._scale = manifest, depth, scale
         self._depth: DepthEstimator | None = None
-        if depth == "builtin":
+        network = as_network(depth)
+        if network is not None:
+            load_preprocessing(network)  # what cannot be loaded fails here, and not in a worker
+        elif depth == STORED:
+            check_depth_maps("photos", manifest)
+        elif depth == "builtin":
             warn_once()  # here, and not in every worker
 
     @property
@@ -94,15 +107,20 @@ class PhotoSource:
         return member.shard_url, member.key
 
     def make(self, index: int, size: tuple[int, int], draw: Draw) -> Example:
-        photo = decode_rgb(self._manifest.read(index))
-        height, width = photo.shape[:2]
+        file = PhotoFile(self._manifest.read(index))
+        width, height, _ = file.header
         if min(height, width) < SHORTEST_SIDE_PX:
             raise BadPhoto(f"too small: a side shorter than {SHORTEST_SIDE_PX} px: {width}x{height}")
-        if self._depth is None:
-            self._depth = load_depth(self._name)
-        image = torch.from_numpy(photo).permute(2, 0, 1)[None].to(torch.float32, memory_format=torch.contiguous_format)
-        with torch.inference_mode():
-            return from_photo(photo, normalize_inverse_depth(self._depth(image)), self._scale, size, draw)
+        photo = file.decode()
+        if self._name == STORED:
+            depth = torch.from_numpy(decode_depth(self._manifest.read_depth(index), file.header))[None, None]
+        else:
+            if self._depth is None:
+                self._depth = load_depth(self._name)
+            image = torch.from_numpy(photo).permute(2, 0, 1)[None].to(torch.float32, memory_format=torch.contiguous_format)
+            with torch.inference_mode():
+                depth = self._depth(image)
+        return from_photo(photo, normalize_inverse_depth(depth), self._scale, size, draw)
 
 
 @dataclass(frozen=True)

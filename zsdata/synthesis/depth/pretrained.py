@@ -6,6 +6,7 @@ The work has two halves that may run in two places: `prepare` resizes a photo on
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections import defaultdict
 from collections.abc import Sequence
@@ -25,6 +26,7 @@ DEPTH_MODELS = ("glpn", "tipsv2_dpt", "zoedepth")
 METRIC_DPT_BACKBONES = ("dinov2", "dinov2_with_registers")  # DPT heads on DINOv2 predict metres (NYU, KITTI); MiDaS's predict inverse depth
 
 SMALLEST_DEPTH_M = 1e-3
+HUB_ID = re.compile(r"[\w.-]+(/[\w.-]+)?")
 LAST_LAYERS = ("head", "relative_head", "metric_head")  # names that transformers' depth networks give them
 # DPT networks have these weights, published checkpoints do not, and nothing uses them: the first stage fuses nothing.
 NEVER_USED = re.compile(r"fusion_stage\.layers\.0\.residual_layer1\.")
@@ -158,6 +160,10 @@ def load_preprocessing(network: DepthNetwork) -> Preprocessing:
     Raises:
         ImportError, OSError, ValueError: as `PretrainedDepth`.
     """
+    if not os.path.isdir(network.name) and not HUB_ID.fullmatch(network.name):
+        raise FileNotFoundError(
+            f'depth="{network.name}" is neither "builtin", "stored", a folder that is there, nor a Hub id ("owner/name")'
+        )
     try:
         from transformers import AutoConfig
         from transformers.utils.hub import cached_file
@@ -169,6 +175,8 @@ def load_preprocessing(network: DepthNetwork) -> Preprocessing:
     except OSError as error:
         which = "" if network.revision is None else f', revision "{network.revision}",'
         raise OSError(f'depth="{network.name}"{which} cannot be loaded: {error}') from error
+    except ValueError as error:  # no config.json, or one of a network that this transformers does not know
+        raise ValueError(f'depth="{network.name}" cannot be loaded: {error}') from error
     with open(str(path), encoding="utf-8") as file:
         return read_preprocessing(network.name, json.load(file), config, network.resolution)
 
