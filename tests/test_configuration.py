@@ -141,3 +141,29 @@ def test_schedules_begin_with_epoch_0_and_are_swapped_later(tar, epochs, swap, e
     else:
         stream.set_epoch(epoch)
         assert stream.state_dict()["epoch"] == epoch
+
+
+def test_no_epoch_comes_before_the_first(tar):
+    stream = open_stream(tar)
+    for refused in (lambda: stream.replay(epoch=-1, index=0), lambda: stream.set_epoch(-1), lambda: stream.set_sources(tar, epoch=0)):
+        with pytest.raises((IndexError, ValueError), match=r"got (-1|0)"):
+            refused()
+
+
+def test_a_loop_ends_where_the_stream_is_sent_elsewhere(tar):
+    stream = open_stream(tar)
+    seen = []
+    for pair in stream:
+        seen.append((pair.meta["epoch"], pair.meta["index"]))
+        stream.set_epoch(3)
+    assert seen == [(0, 0)] and next(iter(stream)).meta["epoch"] == 3
+
+
+@pytest.mark.parametrize(("world_size", "said"), [(1, []), (2, ["rank 1 of 2 stops: RuntimeError: sample 1 of epoch 0"])])
+def test_a_rank_that_stops_says_which_one_it_is(tar, world_size, said, caplog):
+    def broken(images):
+        raise RuntimeError("out of luck")
+
+    with open_stream(tar, depth=broken).loader(1, rank=world_size - 1, world_size=world_size) as loader, pytest.raises(RuntimeError):
+        next(iter(loader))
+    assert [record.getMessage()[: len(text)] for record, text in zip(caplog.records, said, strict=True)] == said
