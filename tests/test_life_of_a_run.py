@@ -132,7 +132,10 @@ def test_ctrl_c_is_one_keyboard_interrupt_and_the_processes_are_gone(tar, tmp_pa
     below = processes_below(run.pid)
     assert len(below) >= 2
     os.killpg(run.pid, signal.SIGINT)  # as a terminal does it: to every process of the group
-    _, errors = run.communicate(timeout=30)
+    try:
+        _, errors = run.communicate(timeout=30)
+    finally:
+        run.kill()
     assert run.returncode == -signal.SIGINT
     assert errors.count("Traceback") == errors.count("KeyboardInterrupt") == 1, errors
     assert gone(below)
