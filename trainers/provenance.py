@@ -10,7 +10,7 @@ import torch
 
 from zsdata import ZeroStereoStream
 
-PACKAGES = ("zsdata", "torch", "accelerate", "numpy")
+PACKAGES = ("zsdata", "accelerate", "numpy")
 
 
 def provenance(stream: ZeroStereoStream, arguments: dict[str, Any]) -> dict[str, Any]:
@@ -24,6 +24,10 @@ def provenance(stream: ZeroStereoStream, arguments: dict[str, Any]) -> dict[str,
     made_by = tell() if tell is not None else {name: arguments.get(name) for name in ("depth", "inpaint")}
     return {
         "stream": made_by,
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
+        "versions": {
+            "python": platform.python_version(),
+            "torch": torch.__version__,  # its metadata does not say for which CUDA it was built
+            **{name: version(name) for name in PACKAGES},
+        },
         "device": torch.cuda.get_device_name() if torch.cuda.is_available() else platform.processor() or platform.machine(),
     }

@@ -34,6 +34,7 @@ LOOK_SECONDS = 1.0  # between two looks at the workers, and at the parent proces
 GRACE_SECONDS = 2.0  # for a worker to finish its sample when the pool is closed
 REQUEST_BYTES = 200_000  # the longest message that the socket takes
 _SET_PARENT_DEATH_SIGNAL = 1  # prctl
+_starting = threading.Lock()  # one fork at a time: two would copy each other's half-made channels, and filelock refuses the second one
 
 Request = Sequence[tuple[int, int]]  # (epoch, index) of each sample of a batch
 
@@ -154,7 +155,7 @@ class WorkerPool:
             daemon=True,
         )
         try:
-            with warnings.catch_warnings():
+            with _starting, warnings.catch_warnings():
                 # Python 3.12 warns of forks beside threads; torch's DataLoader forks so too. OpenCV's threads, which hung, are put to rest.
                 warnings.filterwarnings("ignore", "This process .* is multi-threaded", DeprecationWarning)
                 process.start()

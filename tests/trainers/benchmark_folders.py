@@ -35,7 +35,8 @@ def made_up_pair(seed: int, holes: tuple[float, ...], largest: float = 60.0) -> 
 
 def write_image(path: Path, image: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), image[..., ::-1] if image.ndim == 3 else image)
+    uncompressed = [cv2.IMWRITE_TIFF_COMPRESSION, 1]  # OpenCV 4 rounds three channels of floats to 3 digits otherwise
+    assert cv2.imwrite(str(path), image[..., ::-1] if image.ndim == 3 else image, uncompressed if path.suffix == ".tif" else [])
 
 
 def write_pfm(path: Path, values: np.ndarray, order: str = "<") -> None:
