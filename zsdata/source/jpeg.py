@@ -76,9 +76,9 @@ class Jpeg:
             raise BadPhoto("damaged: no size in the JPEG header")
         if data.rfind(_END, end) < 0:  # scan data never hold this pair, and OpenCV would fill what is missing with grey
             raise BadPhoto("truncated: a JPEG without its end")
-        if data.count(_SCAN, end) >= MAX_SCANS and _scans(data, end) > MAX_SCANS:
+        one_scan = not frame.progressive and data[start] == frame.components  # the decoder stops after it, whatever comes
+        if not one_scan and data.count(_SCAN, end) >= MAX_SCANS and _scans(data, end) > MAX_SCANS:
             raise BadPhoto(f"damaged: a JPEG of more than {MAX_SCANS} scans")
-        one_scan = not frame.progressive and data[start] == frame.components
         return Jpeg(data, frame.width, frame.height, frame.components, 0 if one_scan else frame.coefficient_bytes, orientation, end)
 
     def decode(self, reduction: int = 1) -> np.ndarray:
