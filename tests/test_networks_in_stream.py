@@ -1,4 +1,7 @@
 import json
+import os
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -59,6 +62,38 @@ def test_a_network_that_is_nowhere_is_an_error_at_once_and_in_words(tar, tmp_pat
         ZeroStereoStream(tar, depth="/no/such")
     with pytest.raises((OSError, ValueError), match=r'depth=".*" cannot be loaded'):
         ZeroStereoStream(tar, depth=tmp_path)
+
+
+def test_a_network_of_the_hub_stays_the_one_that_it_was_when_the_stream_was_made(folder, tar, tmp_path):
+    repository, commits = tmp_path / "hub" / "models--somebody--depth", ["a" * 40, "b" * 40]
+    for seed, commit in enumerate(commits):
+        small.save_small_network("depth_anything", repository / "snapshots" / commit, seed=seed)
+    (repository / "refs").mkdir()
+    (repository / "refs" / "main").write_text(commits[0])
+    program = f"""
+import json, sys
+from pathlib import Path
+from tests.scenes import grey_fill
+from zsdata import ZeroStereoStream
+
+def stream(depth, **options):
+    return ZeroStereoStream({str(tar)!r}, size={SIZE}, depth=depth, inpaint=grey_fill, **options)
+
+def disparities(stream):
+    with stream.loader(3, num_workers=1) as loader:
+        return [batch.disparity.tolist() for batch in loader]
+
+first, cached = stream("somebody/depth"), stream("somebody/depth", depth_cache={str(tmp_path / "cache")!r})
+Path({str(repository / "refs" / "main")!r}).write_text({commits[1]!r})
+second = stream("somebody/depth")
+old, new = (disparities(stream({str(repository / "snapshots")!r} + "/" + commit)) for commit in {commits})
+assert disparities(first) == disparities(cached) == old != new == disparities(second)
+assert [one.provenance()["depth"][0]["revision"] for one in (first, second)] == {commits}
+second.load_state_dict(first.state_dict())
+"""
+    environment = {**os.environ, "HF_HOME": str(tmp_path), "HF_HUB_CACHE": str(tmp_path / "hub"), "HF_HUB_OFFLINE": "1"}
+    result = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=200)
+    assert result.returncode == 0, result.stderr
 
 
 def test_auto_keeps_depth_in_the_workers_where_the_loader_has_no_gpu(folder, tar):

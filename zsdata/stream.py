@@ -30,7 +30,7 @@ from zsdata.sources import Schedule
 from zsdata.synthesis.depth import DepthEstimator, DepthNetwork, as_network, load_depth
 from zsdata.synthesis.depth.builtin import warn_once
 from zsdata.synthesis.depth.cache import DepthCache
-from zsdata.synthesis.depth.identity import depth_identity
+from zsdata.synthesis.depth.identity import depth_identity, pinned
 from zsdata.synthesis.depth.options import STORED
 from zsdata.synthesis.depth.pretrained import load_preprocessing
 from zsdata.synthesis.disparity import AdaptiveDisparity, UniformDisparity
@@ -155,14 +155,18 @@ class ZeroStereoStream(IterableDataset):
         if commercial_safe:
             require_commercial(depth, "depth")
             require_commercial(self._inpaint, "inpaint")
-        network = as_network(depth)
+        self._depth = depth
+        network, preprocessing = as_network(depth), None
+        if network is not None:
+            preprocessing = load_preprocessing(network)
+            depth = pinned(network)
         synthesis = synthesis if synthesis is not None else SynthesisConfig()
         self._recipe = Recipe(
             seed=seed,
             size=None if size is None else (int(size[0]), int(size[1])),
             schedule=self._schedule,
             depth=depth,
-            preprocessing=None if network is None else load_preprocessing(network),
+            preprocessing=preprocessing,
             depth_cache=_open_cache(depth_cache, depth_cache_bytes, depth, synthesis),
             disparity=disparity if disparity is not None else AdaptiveDisparity(),
             view=view if view is not None else ViewConfig(),
@@ -367,7 +371,7 @@ class ZeroStereoStream(IterableDataset):
             "size": recipe.size,
             "views_per_image": self._views_per_image,
             "reuse": recipe.reuse,
-            "depth": _name_of(recipe.depth),
+            "depth": _name_of(self._depth),
             "inpaint": _name_of(self._inpaint),
             "disparity": [type(recipe.disparity).__name__, asdict(recipe.disparity)],
             "view": asdict(recipe.view),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from huggingface_hub import try_to_load_from_cache
@@ -74,6 +75,14 @@ def hub_commit(name: str, revision: str | None = None) -> str:
             f"Download it first: python -c 'import zsdata; zsdata.load_depth(\"{name}\"{wanted})'"
         )
     return os.path.basename(os.path.dirname(config))
+
+
+def pinned(network: DepthNetwork) -> DepthNetwork:
+    """The network of a Hub id at the commit that the local Hub cache has: what moves on the Hub changes no run that goes on, nor what lies
+    in a depth cache. See `depth_identity` for the errors."""
+    if os.path.isdir(network.name):
+        return network
+    return replace(network, revision=hub_commit(network.name, network.revision))
 
 
 def _folder_digest(folder: str) -> str:
