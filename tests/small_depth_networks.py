@@ -109,8 +109,9 @@ NETWORKS: dict[str, tuple[Callable[[], Any], str, dict[str, Any]]] = {
     "dinov2_dpt": (dinov2_dpt, DPT, {"do_resize": False, "do_pad": True, "size_divisor": 14, **IMAGENET}),
     "glpn": (glpn, "GLPNImageProcessor", {"size_divisor": 32}),
     "zoe": (zoe, "ZoeDepthImageProcessor", {"size": {"height": 64, "width": 96}, "ensure_multiple_of": 32}),
-    "depth_pro": (depth_pro, "DepthProImageProcessor", {"size": {"height": 56, "width": 56}}),
 }
+if hasattr(hf, "DepthProConfig"):  # since transformers 4.49
+    NETWORKS["depth_pro"] = (depth_pro, "DepthProImageProcessor", {"size": {"height": 56, "width": 56}})
 
 
 def save_small_network(kind: str, folder: Path, seed: int = 0) -> Path:

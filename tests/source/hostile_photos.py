@@ -3,6 +3,7 @@
 # ruff: noqa: E501  one file a line
 from __future__ import annotations
 
+import gzip
 import io
 import pickle
 import random
@@ -311,7 +312,7 @@ def _not_photos() -> dict[str, Odd]:
         "json error": (b'{"error": "expired"}', "not a JPEG, PNG or WebP"),
         "git lfs pointer": (b"version https://git-lfs.github.com/spec/v1\n", "not a JPEG, PNG or WebP: a Git LFS pointer"),
         "pdf": (b"%PDF-1.4", "not a JPEG, PNG or WebP: PDF"),
-        "gzip": (zlib.compress(PNG, wbits=31), "not a JPEG, PNG or WebP: gzip"),
+        "gzip": (gzip.compress(PNG, mtime=0), "not a JPEG, PNG or WebP: gzip"),
         "numpy archive": (archive.getvalue(), "not a JPEG, PNG or WebP: a zip"),
         "pickle that runs code": (pickle.dumps(Canary()), "not a JPEG, PNG or WebP"),
         "numpy file that runs code": (objects.getvalue(), "not a JPEG, PNG or WebP"),

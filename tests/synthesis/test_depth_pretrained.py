@@ -98,6 +98,10 @@ def test_the_result_is_that_of_transformers_own_processor_and_model(folders, kin
     assert (depth(tensor.float()) - expected).abs().max() < 0.02 * (expected.max() - expected.min())
 
 
+needs_depth_pro = pytest.mark.skipif("depth_pro" not in small.NETWORKS, reason="needs transformers 4.49")
+
+
+@needs_depth_pro
 def test_depth_pro_is_given_its_square_and_not_inverted(folders):
     """transformers turns Depth Pro's prediction, which is inverse depth, into depth only after the network."""
     path, images = folders("depth_pro"), photos(1)
@@ -140,6 +144,10 @@ def test_networks_that_take_squares_get_squares(folders):
     assert load_depth(folders("midas_vit"), resolution=96)(photos(1)).shape == (1, 1, 90, 131)
     with pytest.raises(ValueError, match='takes squares alone: resolution is a number of pixels or None; got "native"'):
         load_depth(folders("midas_vit"), resolution="native")
+
+
+@needs_depth_pro
+def test_depth_pro_takes_one_size(folders):
     with pytest.raises(ValueError, match="takes 56x56 pixels and nothing else; got resolution=112"):
         load_depth(folders("depth_pro"), resolution=112)
 

@@ -127,7 +127,7 @@ def test_a_grey_png_gives_the_label_to_half_a_step_of_its_values(tmp_path):
         assert close.float().mean() > 0.99  # the sharpening may decide otherwise where it chooses between two neighbours
 
 
-@pytest.mark.parametrize("transform", [lambda depth: depth * 2**70, lambda depth: depth * 2 - 8, lambda depth: depth.astype("<f8") * 4])
+@pytest.mark.parametrize("transform", [lambda depth: depth * 2.0**70, lambda depth: depth * 2 - 8, lambda depth: depth.astype("<f8") * 4])
 def test_scale_and_offset_of_a_map_change_nothing_that_matters(tmp_path, plain, tar, transform):
     shard = write_tar(tmp_path / "photos.tar", with_depth(to_bytes=lambda depth: npy(transform(depth))))
     for pair, expected in zip(open_stored(shard), open_stored(tar), strict=True):

@@ -386,9 +386,9 @@ def test_two_ranks_train_as_one_with_twice_the_batch_and_each_goes_on_where_the_
 
 
 def test_two_ranks_train_igev_stereo_as_one_with_twice_the_batch(tar, tmp_path, monkeypatch):
-    """As its volumes are normalised by the pairs of both ranks."""
+    """As its volumes are normalised by the pairs of both ranks. In small steps: AdamW makes whole ones of gradients that are mere rounding."""
     two, one = tmp_path / "two", tmp_path / "one"
-    small = "--hidden-dims 16 16 16 --corr-radius 2 --max-disp 32 --n-gru-layers 2 --steps 4".split()
+    small = "--hidden-dims 16 16 16 --corr-radius 2 --max-disp 32 --n-gru-layers 2 --steps 4 --learning-rate 1e-5".split()
     done = launch(arguments_for(tar, two, small=small), 2, "tests/trainers/record_samples.py", TORCHRUN, TRAINER="igev")
     assert done.returncode == 0, done.stderr[-3000:]
     run_command(monkeypatch, *arguments_for(tar, one, "--batch-size", 2, small=small), trainer=igev)
@@ -396,7 +396,8 @@ def test_two_ranks_train_igev_stereo_as_one_with_twice_the_batch(tar, tmp_path, 
     assert len(logs[0]) == 4
     for name in (*TERMS, "initial_term"):
         curves = [[line[name] for line in log] for log in logs]
-        assert curves[1] == pytest.approx(curves[0], rel=1e-4), name
+        rounding = 1e-3 if name == "gradient_norm" else 1e-5  # gradients jump where the loss has an edge
+        assert curves[1] == pytest.approx(curves[0], rel=rounding), name
 
 
 def test_a_nan_or_an_explosion_on_one_rank_skips_the_step_on_both(tar, tmp_path):

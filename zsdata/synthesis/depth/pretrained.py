@@ -56,7 +56,8 @@ class PretrainedDepth:
         self.preprocessing = load_preprocessing(network)
         from transformers import AutoModelForDepthEstimation
 
-        loaded, report = AutoModelForDepthEstimation.from_pretrained(name, revision=network.revision, output_loading_info=True)
+        with torch.random.fork_rng(devices=[]):  # older transformers fill the weights with random numbers first
+            loaded, report = AutoModelForDepthEstimation.from_pretrained(name, revision=network.revision, output_loading_info=True)
         missing = sorted(key for key in report["missing_keys"] if not NEVER_USED.search(key))
         if missing:
             raise ValueError(f'depth="{name}" lacks {len(missing)} weights, "{missing[0]}" for one; download it again')

@@ -120,7 +120,8 @@ def _load(load: Any, name: str, subfolder: str, part: str, revision: str | None,
 def _load_weights(network: Any, name: str, subfolder: str, part: str, revision: str | None, **options: Any) -> Any:
     """A network with all of its weights; the libraries themselves fill gaps with random numbers and only log it."""
     options |= {"use_safetensors": True, "output_loading_info": True}
-    loaded, report = _load(network.from_pretrained, name, subfolder, part, revision, **options)
+    with torch.random.fork_rng(devices=[]):  # older transformers fill the weights with random numbers first
+        loaded, report = _load(network.from_pretrained, name, subfolder, part, revision, **options)
     if report["missing_keys"]:
         missing = sorted(report["missing_keys"])
         raise ValueError(
