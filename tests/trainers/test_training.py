@@ -386,7 +386,7 @@ def test_two_ranks_train_as_one_with_twice_the_batch_and_each_goes_on_where_the_
 
 
 def test_two_ranks_train_igev_stereo_as_one_with_twice_the_batch(tar, tmp_path, monkeypatch):
-    """As its volumes are normalised by the pairs of both ranks. In small steps: AdamW makes whole ones of gradients that are mere rounding."""
+    """As its volumes are normalised by the pairs of both ranks. Small steps: AdamW makes whole ones of gradients that are mere rounding."""
     two, one = tmp_path / "two", tmp_path / "one"
     small = "--hidden-dims 16 16 16 --corr-radius 2 --max-disp 32 --n-gru-layers 2 --steps 4 --learning-rate 1e-5".split()
     done = launch(arguments_for(tar, two, small=small), 2, "tests/trainers/record_samples.py", TORCHRUN, TRAINER="igev")
