@@ -26,7 +26,7 @@ from trainers.pairs_on_disk import StereoPair
 from trainers.pipeline_folder import UNET, write_pipeline
 from trainers.weight_average import WeightAverage, weights_of
 from zsdata.faults import FailureBudget, FaultLog
-from zsdata.position import Position
+from zsdata.position import Position, require_one_place
 from zsdata.synthesis.inpaint import load_inpainter
 from zsdata.synthesis.inpaint.diffusion_parts import CELL_PX, load_diffusion_parts
 
@@ -100,7 +100,7 @@ def tune(
         tracker: any of Accelerate's, or None.
 
     Raises:
-        ValueError, OSError: a pipeline that cannot be used, or a checkpoint of other data or options.
+        ValueError, OSError: a pipeline that cannot be used, a checkpoint of other data or options, or a rank that has other data.
         RuntimeError: the loss is not finite; it names the examples.
     """
     accelerator = Accelerator(
@@ -126,6 +126,7 @@ def tune(
         Position.from_state(state["examples"], examples.position(step))
         unet = type(unet).from_pretrained(checkpoint / PIPELINE / UNET, use_safetensors=True)
         accelerator.print(f"resumed from {checkpoint} at step {step}")
+    require_one_place(gather_object([examples.position(step).to_state()]))
     average = None if config.ema is None else WeightAverage(unet, config.ema)
     if training is not None and training["weights"]:
         unet.load_state_dict(training["weights"])

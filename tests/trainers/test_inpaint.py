@@ -17,7 +17,7 @@ from tests.scenes import SHARED, layered_depth, photo, photo_tar, write_tar
 from tests.small_pipeline import save_small_pipeline
 from tests.trainers.test_inpaint_data import pfm, png
 from tests.trainers.test_training import launch
-from trainers import inpaint, run_folder
+from trainers import inpaint, inpaint_loop, run_folder
 from trainers.arguments import run as run_trainer
 from trainers.hole_scores import hole_cases, score_holes
 from trainers.inpaint_data.layouts import StereoFolder
@@ -316,6 +316,13 @@ def test_a_pipeline_that_predicts_no_noise_is_refused(photos, tmp_path):
     velocity = save_small_pipeline(tmp_path / "velocity", prediction_type="v_prediction")
     with pytest.raises(ValueError, match="predicts v_prediction; this trainer teaches those that predict noise"):
         run(velocity, examples_of(photos=photos), tmp_path / "run", config())
+
+
+def test_a_rank_with_other_photos_is_named_before_the_first_step(pipeline, photos, tmp_path, monkeypatch):
+    others = examples_of(photos=photo_tar(tmp_path / "photos.tar", 3)).position(0).to_state()
+    monkeypatch.setattr(inpaint_loop, "gather_object", lambda states: [*states, others])  # two ranks, as one of them sees it
+    with pytest.raises(ValueError, match="rank 1 differs from rank 0: its manifest is"):
+        run(pipeline, examples_of(photos=photos), tmp_path / "run", config())
 
 
 def test_a_loss_that_is_not_finite_names_the_examples(pipeline, photos, tmp_path, monkeypatch):
