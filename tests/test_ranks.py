@@ -212,6 +212,7 @@ def train_under_accelerate(rank, world, port, tar, folder, load, save_after, wor
         "MASTER_ADDR": "127.0.0.1",
         "MASTER_PORT": str(port),
     }
+    AcceleratorState._reset_state(reset_partial_state=True)  # the parent's, a single process's, came along with the fork
     accelerator = Accelerator(cpu=True)
     assert (accelerator.process_index, accelerator.num_processes) == (rank, world)
     place = {"rank": accelerator.process_index, "world_size": accelerator.num_processes}
