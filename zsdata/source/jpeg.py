@@ -90,8 +90,10 @@ class Jpeg:
         image = decode_color(self.data, reduction)
         if self.components < 4 and (image[-1, -1] == 128).all() and self._lacks_scan_data(image, reduction):
             raise BadPhoto("truncated: JPEG data are missing before its end")
-        if self.data.find(_ZEROS, self.scan, self._scan_end) >= 0 and (
-            self._lacks_scan_data(image, reduction) or self._has_surplus_scan_data(image, reduction)
+        if (
+            self.data.find(_ZEROS, self.scan) >= 0  # quick, and hardly any photo has them
+            and self.data.find(_ZEROS, self.scan, self._scan_end) >= 0
+            and (self._lacks_scan_data(image, reduction) or self._has_surplus_scan_data(image, reduction))
         ):
             raise BadPhoto("damaged: zeros among the JPEG data")
         return image

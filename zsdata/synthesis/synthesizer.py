@@ -132,7 +132,7 @@ def synthesize(photo_view: Tensor, depth: DepthMaps, view: View, scale: float, c
         largest_px = scale * depth.inverse_depth.shape[-1] * view.scale_x
         disparity = view_map(depth.inverse_depth, view, depth.first_row).mul_(largest_px / NEAREST)
         disparity = dilate_disparity(disparity, config.dilate_px)
-        confidence = view_map(depth.confidence, view, depth.first_row).div_(CERTAIN)
+        confidence = view_map(depth.confidence, view, depth.first_row)[..., : view.width - view.margin].div(CERTAIN)
     with meter.stage("sharpen"):
         disparity = sharpen_disparity(disparity).clamp_(min=SMALLEST_DISPARITY_PX)
     with meter.stage("warp"):
@@ -143,7 +143,7 @@ def synthesize(photo_view: Tensor, depth: DepthMaps, view: View, scale: float, c
     return Synthesized(
         left=photo_view[..., :width],
         disparity=disparity[..., :width],
-        confidence=confidence[..., :width],
+        confidence=confidence,
         nonocclusion_mask=warped.nonocclusion_mask[..., :width],
         right=F.pad(warped.right, (0, missing)) if missing else warped.right,
         inpaint_mask=F.pad(warped.inpaint_mask, (0, missing), value=True) if missing else warped.inpaint_mask,
