@@ -211,6 +211,7 @@ def train_under_accelerate(rank, world, port, tar, folder, load, save_after, wor
         "WORLD_SIZE": str(world),
         "MASTER_ADDR": "127.0.0.1",
         "MASTER_PORT": str(port),
+        "OMP_NUM_THREADS": "1",  # or Accelerate sets it, with a warning
     }
     AcceleratorState._reset_state(reset_partial_state=True)  # the parent's, a single process's, came along with the fork
     accelerator = Accelerator(cpu=True)
