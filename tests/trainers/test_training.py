@@ -356,7 +356,8 @@ def read_lines(path):
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-TERMS = ("loss", "epe", "disparity_term", "photometric_term", "gradient_norm")
+# How far runs may be apart that differ in rounding alone. Gradients jump where the loss has an edge.
+TERMS = {"loss": 1e-5, "epe": 1e-5, "disparity_term": 1e-5, "photometric_term": 1e-5, "gradient_norm": 1e-3}
 
 
 def test_two_ranks_train_as_one_with_twice_the_batch_and_each_goes_on_where_the_other_stopped(tar, tmp_path, monkeypatch):
@@ -378,11 +379,11 @@ def test_two_ranks_train_as_one_with_twice_the_batch_and_each_goes_on_where_the_
     assert [line["samples"] for line in logs[0]] == [line["samples"] for line in logs[1]] == [2, 4, 6, 0]
     for log in logs[2:]:
         assert [(line["step"], line["samples"]) for line in log] == [(3, 6), (4, 0)]
-    for name in TERMS:
+    for name, rounding in TERMS.items():
         curves = [[line[name] for line in log] for log in logs]
-        assert curves[1] == pytest.approx(curves[0], rel=1e-5), name
+        assert curves[1] == pytest.approx(curves[0], rel=rounding), name
         for curve in curves[2:]:
-            assert curve == pytest.approx(curves[0][2:], rel=1e-5), name
+            assert curve == pytest.approx(curves[0][2:], rel=rounding), name
 
 
 def test_two_ranks_train_igev_stereo_as_one_with_twice_the_batch(tar, tmp_path, monkeypatch):
@@ -394,9 +395,8 @@ def test_two_ranks_train_igev_stereo_as_one_with_twice_the_batch(tar, tmp_path, 
     run_command(monkeypatch, *arguments_for(tar, one, "--batch-size", 2, small=small), trainer=igev)
     logs = [read_lines(folder / "log.jsonl") for folder in (two, one)]
     assert len(logs[0]) == 4
-    for name in (*TERMS, "initial_term"):
+    for name, rounding in {**TERMS, "initial_term": 1e-5}.items():
         curves = [[line[name] for line in log] for log in logs]
-        rounding = 1e-3 if name == "gradient_norm" else 1e-5  # gradients jump where the loss has an edge
         assert curves[1] == pytest.approx(curves[0], rel=rounding), name
 
 
