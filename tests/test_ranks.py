@@ -15,6 +15,7 @@ from datetime import timedelta
 from pathlib import Path
 
 import pytest
+import torch
 import torch.distributed as dist
 from accelerate import Accelerator
 from accelerate.state import AcceleratorState
@@ -100,7 +101,8 @@ def damage(tar):
 
 
 def run_rank(rank, log, do, *arguments):
-    """Into a file of its own, as a launcher does it."""
+    """Into a file of its own and on one thread, as a launcher does it; OpenMP's threads, which earlier tests used, outlive no fork."""
+    torch.set_num_threads(1)
     with open(log, "w") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
