@@ -30,11 +30,11 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from trainers.models import Matcher, load_matcher
 from trainers.training_loss import TrainingLoss
 from zsdata import Masks, StereoBatch
+from zsdata.progress import Progress
 
 MODELS = {"raft": "raft_stereo", "igev": "igev_stereo"}
 GIB = 2**30
@@ -244,7 +244,7 @@ def main() -> None:
         weights = load_matcher(MODELS[model]).state_dict()
         plain: dict[str, dict[str, float]] = {}  # what the others are measured by
         expected = torch.zeros(())
-        for name in tqdm(ways, desc=model, leave=False, disable=not sys.stderr.isatty()):
+        for name in Progress(ways, desc=model, leave=False, disable=not sys.stderr.isatty()):
             gc.collect()
             if device.type == "cuda":
                 torch.cuda.empty_cache()

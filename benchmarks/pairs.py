@@ -40,7 +40,6 @@ import PIL
 import torch
 from published_set import CROP, decode, decode_and_augment
 from torch import Tensor
-from tqdm import tqdm
 
 import zsdata.meter
 from zsdata import AugmentConfig, ZeroStereoStream, decode_photo, dilate_disparity, forward_warp, load_depth, normalize_inverse_depth
@@ -48,6 +47,7 @@ from zsdata.bench import WORKER_STAGES, feed, fill_depth_cache, leave_holes, spl
 from zsdata.example_photos import example_photos
 from zsdata.export import export_pairs
 from zsdata.exported import read_exported
+from zsdata.progress import Progress
 from zsdata.source.pack import pack
 from zsdata.source.photo import BadPhoto, probe_size
 from zsdata.synthesis.depth.builtin import BuiltinDepthWarning
@@ -117,7 +117,7 @@ def in_turn(work: Mapping[str, Callable[[int, int], object]], photos: int, round
     counts as the seconds of its parts, "NAME: PART".
     """
     times: dict[str, np.ndarray] = {}
-    with tqdm(total=rounds * len(work), desc=title, disable=None, leave=False) as bar, stages_by_thread_time():
+    with Progress(total=rounds * len(work), desc=title, disable=None, leave=False) as bar, stages_by_thread_time():
         for number in rounds_in_time(rounds):
             for name, do in work.items():
                 for photo in range(photos):
@@ -254,7 +254,7 @@ def print_rates(sets: Sequence[PhotoSet], workers: Sequence[int], pairs: int, ro
     kinds = [(photos, CROP) for photos in sets] + [(middle, crop) for crop in CROPS if crop != CROP]
     streams = [photos.stream(crop, finished=False, epoch_size=10**6) for photos, crop in kinds]
     rates: dict[tuple[int, int], list[tuple[float, float]]] = {}  # (kind, workers) -> pairs per second, over reading, by round
-    with tqdm(total=rounds * len(kinds), desc="pairs per second", disable=None, leave=False) as bar:
+    with Progress(total=rounds * len(kinds), desc="pairs per second", disable=None, leave=False) as bar:
         for _ in rounds_in_time(rounds):
             for kind, (photos, _) in enumerate(kinds):
                 start = time.perf_counter()
@@ -283,7 +283,7 @@ def print_end_to_end(photos: PhotoSet, workers: Sequence[int], device: torch.dev
     """Finished batches, as training takes them: shares of the stages, pairs per second, and how many batches lie ready."""
     stream, counts = photos.stream(epoch_size=10**6), [0, *workers]
     runs = {count: [] for count in counts}
-    with tqdm(total=rounds * len(counts), desc=f"finished batches on {device}", unit="run", disable=None, leave=False) as bar:
+    with Progress(total=rounds * len(counts), desc=f"finished batches on {device}", unit="run", disable=None, leave=False) as bar:
         for _ in rounds_in_time(rounds):
             for count in counts:
                 batches = max(2 * count, pairs // BATCH_SIZE)
@@ -464,7 +464,7 @@ def measure(folder: Path, options: argparse.Namespace, device: torch.device) -> 
     print(f"{here['processor']}, {here['cores']} cores, load {here['load']:.1f}; {here['gpu'] or 'no GPU used'}; {versions}")
 
     pictures = pictures_of(options.photos, count)
-    sets = [PhotoSet(folder, size, pictures) for size in tqdm(SIZES, desc="photos, depth, finished pairs", disable=None, leave=False)]
+    sets = [PhotoSet(folder, size, pictures) for size in Progress(SIZES, desc="photos, depth, finished pairs", disable=None, leave=False)]
     for photos in sets:
         enlarged = sum(min(p.shape[0] / photos.size[0], p.shape[1] / photos.size[1]) < 1 for p in pictures)
         kilobytes = sorted(len(data) // 1000 for data in photos.jpegs)

@@ -32,7 +32,6 @@ import cv2
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from trainers.pairs_on_disk import StereoPair, find_pairs, read_pair
 from zsdata import (
@@ -49,6 +48,7 @@ from zsdata import (
 )
 from zsdata.example_photos import example_photos
 from zsdata.metrics import reconstruction_error, reconstruction_maps
+from zsdata.progress import Progress
 from zsdata.seeding import rng
 from zsdata.synthesis.depth.builtin import BuiltinDepthWarning
 from zsdata.synthesis.disparity import SMALLEST_DISPARITY_PX
@@ -152,7 +152,7 @@ def median_ms(work: Callable[[], object], repeats: int = 3) -> float:
 def measure_photos(files: Sequence[Path]) -> None:
     depth = load_depth("builtin")
     tables = {title: PhotoTable(title) for title in SCALES}
-    for index, file in enumerate(tqdm(files, unit="photo", desc="photos")):
+    for index, file in enumerate(Progress(files, unit="photo", desc="photos")):
         left = decode_photo(file.read_bytes()).unsqueeze(0).float()
         jpeg = cv2.imencode(".jpg", left[0].permute(1, 2, 0).byte().numpy()[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
         decode_ms = median_ms(lambda jpeg=jpeg: cv2.imdecode(jpeg, cv2.IMREAD_COLOR))
@@ -193,7 +193,7 @@ def score(image: Tensor, other: Tensor, disparity: Tensor, counted: Tensor) -> l
 
 def measure_pairs(folders: Iterable[Path]) -> None:
     pairs = [pair for pair in map(read_pair, folders) if pair.valid.mean() >= DENSE]
-    scores = {pair.name: against_the_truth(pair) for pair in tqdm(pairs, unit="pair", desc="pairs")}
+    scores = {pair.name: against_the_truth(pair) for pair in Progress(pairs, unit="pair", desc="pairs")}
     ways = list(next(iter(scores.values()))) if scores else []
     print(f"\nagainst the true right image, {len(scores)} pairs (PSNR in dB, AbsErr, SSIM)")
     print(f"{'':32}" + "".join(f"{way:>24}" for way in ways))

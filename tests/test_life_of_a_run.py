@@ -13,6 +13,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+import torch
 
 from tests.scenes import jpeg, layered_depth, photo, photo_tar, write_tar
 from tests.test_pool import gone, shared_memory
@@ -187,6 +188,7 @@ class NamedDepth:
 
 
 def run_beside(tar, folder, results):
+    torch.set_num_threads(1)  # OpenMP's threads of a parent that has used them do not come along
     stream = open_stream(tar, depth=NamedDepth(), depth_cache=folder / "depth")
     with stream.loader(BATCH, num_workers=2, rejected=folder / "rejected.jsonl") as loader:
         seen = [seen for batch in loader for seen in seen_in(batch)]
@@ -202,11 +204,16 @@ def test_two_runs_on_one_machine_do_not_meet(tmp_path):
         runs.append(context.Process(target=run_beside, args=(tar, tmp_path, theirs)))
         runs[-1].start()
         ends.append(ours)
-    runs[2].kill()
-    first, second = (end.recv() for end in ends[:2])
-    for run in runs:
-        run.join(RUN_LIMIT_SECONDS)
-    assert [run.exitcode for run in runs] == [0, 0, -signal.SIGKILL]
+    try:
+        runs[2].kill()
+        first, second = (end.recv() for end in ends[:2])
+        for run in runs:
+            run.join(RUN_LIMIT_SECONDS)
+        exits = [run.exitcode for run in runs]
+    finally:
+        for run in runs:
+            run.kill()
+    assert exits == [0, 0, -signal.SIGKILL]
     with open_stream(tar, depth=NamedDepth()).loader(BATCH) as loader:
         alone = [seen for batch in loader for seen in seen_in(batch)]
         refused = sum(loader.stats()["rejected"].values())

@@ -33,7 +33,6 @@ import cv2
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from trainers.benchmarks_on_disk import BENCHMARKS, find_benchmark
 from trainers.models import MATCHERS
@@ -41,6 +40,7 @@ from trainers.pairs_on_disk import StereoPair, find_pairs, motorcycle, pair_file
 from trainers.predictors import MODELS, PRECISIONS, TAKES, find_predictor
 from trainers.scores import all_means, mean_scores, score, table, write_csv
 from trainers.strips import LEAST_ROWS, Predict
+from zsdata.progress import Progress
 
 __all__ = ["evaluate", "mean_scores", "table"]
 
@@ -75,7 +75,7 @@ def evaluate(
         MemoryError: a pair does not fit; names it and what helps.
     """
     results = []
-    for pair in tqdm(pairs, total=total, desc="evaluate", unit="pair", disable=not progress):
+    for pair in Progress(pairs, total=total, desc="evaluate", unit="pair", disable=not progress):
         left, right = (torch.from_numpy(image).to(device).permute(2, 0, 1)[None].float() for image in (pair.left, pair.right))
         begin = time.perf_counter()
         prediction = _predict_or_say_what_helps(predict, left, right, pair.name)

@@ -16,7 +16,6 @@ import torch
 from accelerate import Accelerator
 from accelerate.utils import gather_object
 from torch.utils.data import DataLoader
-from tqdm import tqdm
 
 from trainers import run_folder
 from trainers.hole_scores import HoleCase, hole_cases, mean_hole_scores, score_holes
@@ -27,6 +26,7 @@ from trainers.pipeline_folder import UNET, write_pipeline
 from trainers.weight_average import WeightAverage, weights_of
 from zsdata.faults import FailureBudget, FaultLog
 from zsdata.position import Position, require_one_place
+from zsdata.progress import Progress
 from zsdata.synthesis.inpaint import load_inpainter
 from zsdata.synthesis.inpaint.diffusion_parts import CELL_PX, load_diffusion_parts
 
@@ -189,7 +189,7 @@ def tune(
         validate(pipeline)
     faults = FaultLog(FailureBudget())
     batches = iter(_loader(examples, config, step, accelerator))
-    progress = tqdm(total=config.steps, initial=step, unit="step", disable=not accelerator.is_main_process, dynamic_ncols=True)
+    progress = Progress(total=config.steps, initial=step, unit="step", disable=not accelerator.is_main_process, dynamic_ncols=True)
     mark, waited = (step, time.perf_counter()), 0.0
     while step < config.steps:
         losses = []

@@ -16,7 +16,6 @@ from accelerate import Accelerator
 from accelerate.tracking import GeneralTracker
 from accelerate.utils import gather_object
 from torch import Tensor
-from tqdm import tqdm
 
 from trainers import run_folder
 from trainers.evaluate import mean_scores, table
@@ -30,6 +29,7 @@ from trainers.weight_average import WeightAverage, weights_of
 from zsdata import StereoBatch, ZeroStereoStream
 from zsdata.metrics import reconstruction_error
 from zsdata.position import require_one_place
+from zsdata.progress import Progress
 
 LossFunction = Callable[[Tensor | None, list[Tensor], StereoBatch], tuple[Tensor, dict[str, Any]]]
 
@@ -222,7 +222,7 @@ def train(
         return results
 
     results: dict[str, list[dict[str, Any]]] = {}
-    progress = tqdm(total=config.steps, initial=step, unit="step", disable=not accelerator.is_main_process, dynamic_ncols=True)
+    progress = Progress(total=config.steps, initial=step, unit="step", disable=not accelerator.is_main_process, dynamic_ncols=True)
     mark = _Mark(step, loader.stats()["seconds"].get("wait", 0.0))
     saved_step, judged_step = step, None
     if validation.sets and config.evaluate_first and step == 0:

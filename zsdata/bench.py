@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from zsdata.loader import PREFETCHED_BATCHES
+from zsdata.progress import Progress
 from zsdata.sample import StereoBatch
 from zsdata.stream import ZeroStereoStream
 from zsdata.worker import single_thread
@@ -90,7 +90,7 @@ def bench(
     decoding: list[float] = []
     runs = []
     total = sum(batch_size * (_warm_up(count) + _measured(count, pairs, batch_size)) for count in counts)
-    with tqdm(total=total, unit="pair", disable=None) as bar:
+    with Progress(total=total, unit="pair", disable=None) as bar:
 
         def count_and_decode(batch: StereoBatch) -> None:
             bar.update(batch_size)
@@ -184,7 +184,7 @@ def split_stages(run: Run, device: torch.device) -> tuple[dict[str, float], dict
 def fill_depth_cache(stream: ZeroStereoStream, workers: int, samples: int) -> None:
     """Makes the stream's first samples, so that its depth cache knows their photos; `leave_holes` spares it the inpainting."""
     with stream.loader(1, num_workers=workers) as loader:
-        for _ in tqdm(islice(loader, samples), desc="filling the depth cache", total=samples, unit="pair", disable=None):
+        for _ in Progress(islice(loader, samples), desc="filling the depth cache", total=samples, unit="pair", disable=None):
             pass
 
 

@@ -17,7 +17,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from tqdm import tqdm
 
 import zsdata
 from zsdata.augment import AugmentConfig
@@ -26,6 +25,7 @@ from zsdata.example_photos import EXAMPLE_PHOTOS, pack_example_photos
 from zsdata.export import export_pairs
 from zsdata.faults import BadShard, NoUsablePhoto, TooManyFaults
 from zsdata.preview import contact_sheet
+from zsdata.progress import Progress
 from zsdata.sample import StereoBatch
 from zsdata.source.archive import Problem
 from zsdata.source.compressed import decompress
@@ -78,7 +78,7 @@ def _fail(message: str, status: int) -> int:
 
 def _print_warning(message: Warning | str, *where: object) -> None:
     """A warning in words, without the line of code that it came from."""
-    tqdm.write(f"zsdata: {_printable(str(message))}", file=sys.stderr)
+    Progress.write(f"zsdata: {_printable(str(message))}", file=sys.stderr)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -368,7 +368,7 @@ def _decompress(options: argparse.Namespace) -> int:
 
 def _print_problem(problem: Problem) -> None:
     where = f"at byte {problem.offset:,}" if problem.key is None else f'"{problem.key}"'
-    tqdm.write(_printable(f"{problem.shard} {where}: {problem.reason}"), file=sys.stdout)
+    Progress.write(_printable(f"{problem.shard} {where}: {problem.reason}"), file=sys.stdout)
 
 
 def _preview(options: argparse.Namespace) -> int:
@@ -416,7 +416,7 @@ def _stats(options: argparse.Namespace) -> int:
         augmentation=AugmentConfig.none(),
     )
     pairs = min(options.pairs, len(stream))
-    with tqdm(total=pairs, desc="looking at pairs", unit="pair", disable=None) as bar:
+    with Progress(total=pairs, desc="looking at pairs", unit="pair", disable=None) as bar:
         statistics = source_statistics(stream, pairs, bar.update)
     if options.json is not None:
         options.json.write_text(json.dumps({name: asdict(row) for name, row in statistics.items()}, indent=2) + "\n", encoding="utf-8")
@@ -529,7 +529,7 @@ def _take(stream: ZeroStereoStream, epoch: int, index: int, count: int) -> list[
         raise ValueError(f"--first-index {index}: epoch {epoch} of these sources has samples 0 to {size - 1}, one per photo")
     stream.load_state_dict({**stream.state_dict(), "epoch": epoch, "samples": index})
     pairs: list[StereoBatch] = []
-    with tqdm(total=count, desc="making pairs", unit="pair", disable=None) as bar:
+    with Progress(total=count, desc="making pairs", unit="pair", disable=None) as bar:
         while len(pairs) < count:
             for pair in stream:
                 pairs.append(pair)

@@ -13,8 +13,6 @@ from itertools import chain, islice, repeat
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 import zsdata
 from zsdata.exported import (
     FILE_LIST,
@@ -29,6 +27,7 @@ from zsdata.exported import (
     read_exported,
 )
 from zsdata.loader import StereoLoader
+from zsdata.progress import Progress
 from zsdata.sample import StereoBatch
 from zsdata.stream import ZeroStereoStream
 
@@ -89,7 +88,7 @@ def export_pairs(
         there = file_list.take_up(places)
         with (
             stream.loader(batch_size=1, num_workers=workers) as loader,
-            tqdm(total=count, initial=there, desc="exporting", unit="pair", disable=None) as bar,
+            Progress(total=count, initial=there, desc="exporting", unit="pair", disable=None) as bar,
         ):
             for pair in _pairs(loader, places[there:]):
                 for path, content in encode_pair(pair).items():

@@ -13,6 +13,7 @@ import cv2
 import torch
 from accelerate.state import GradientState
 from torch import Tensor
+from tqdm import tqdm
 
 from zsdata.faults import FailureBudget, FaultLog
 from zsdata.finish import Finisher
@@ -20,6 +21,7 @@ from zsdata.meter import Meter
 from zsdata.pool import Job, WorkerPool
 from zsdata.position import Position
 from zsdata.prepared import Prepared, stack
+from zsdata.progress import use_own_lock
 from zsdata.rejected import RejectedFile
 from zsdata.sample import StereoBatch
 from zsdata.synthesis.depth.builtin import BuiltinDepthWarning
@@ -295,3 +297,4 @@ def _start_worker() -> None:
     warnings.simplefilter("ignore", BuiltinDepthWarning)  # the process that opened the stream has said it
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
+    use_own_lock(tqdm)  # a network may draw bars while it is loaded; a worker that is killed meanwhile must stop no other process

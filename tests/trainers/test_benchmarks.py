@@ -7,10 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import cv2
-import numpy as np
-
-from tests.scenes import photo, photo_tar
+from tests.scenes import photo_tar, shifted_pairs
 from trainers import run_folder
 from trainers.models import load_trained
 
@@ -40,13 +37,7 @@ def test_the_speed_of_the_matchers_is_measured_by_plain_float32_and_by_tf32(tmp_
 
 
 def test_what_ten_minutes_teach_is_told_pair_by_pair_beside_sgbm(tmp_path):
-    for name, shift in (("near", 6), ("far", 4)):
-        folder = tmp_path / "pairs" / name
-        folder.mkdir(parents=True)
-        wide = photo(shift, 64, 96 + shift)
-        cv2.imwrite(str(folder / "left.png"), wide[:, :96])
-        cv2.imwrite(str(folder / "right.png"), wide[:, shift:])
-        np.save(folder / "disp.npy", np.full((64, 96), shift, np.float32))
+    shifted_pairs(tmp_path / "pairs")
     tar, output = photo_tar(tmp_path / "photos.tar", 4), tmp_path / "output"
     tiny = "--size 32 64 --batch-size 1 --iterations 1 --evaluation-iterations 1 --workers 0 --tracker none --hidden-dims 8 8 8".split()
     tiny += "--corr-levels 2 --n-downsample 3 --shared-backbone".split()

@@ -8,15 +8,13 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 import torch
 from accelerate.state import AcceleratorState
 from accelerate.tracking import GeneralTracker
 from safetensors.torch import load_file
 
-from tests.scenes import grey_fill, layered_depth, photo, photo_tar
+from tests.scenes import grey_fill, layered_depth, photo_tar, shifted_pairs
 from trainers import igev, loop, raft, run_folder
 from trainers.arguments import add_training_arguments, leave_black, open_stream, run
 from trainers.evaluate import evaluate
@@ -146,15 +144,7 @@ def test_a_resumed_run_equals_the_unbroken_one(tar, tmp_path, accumulate, worker
 
 @pytest.fixture
 def pairs_folder(tmp_path):
-    """Two pairs of photos, shifted by 4 and 6 px."""
-    for name, shift in (("near", 6), ("far", 4)):
-        folder = tmp_path / "pairs" / name
-        folder.mkdir(parents=True)
-        wide = photo(shift, 64, 96 + shift)
-        cv2.imwrite(str(folder / "left.png"), wide[:, :96])
-        cv2.imwrite(str(folder / "right.png"), wide[:, shift:])
-        np.save(folder / "disp.npy", np.full((64, 96), shift, np.float32))
-    return tmp_path / "pairs"
+    return shifted_pairs(tmp_path / "pairs")
 
 
 def nan_in_step(number, loss):

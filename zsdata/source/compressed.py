@@ -11,9 +11,9 @@ from typing import BinaryIO, cast
 
 from fsspec.compression import compr
 from fsspec.core import url_to_fs
-from tqdm import tqdm
 
 from zsdata.faults import BadShard
+from zsdata.progress import Progress
 from zsdata.source.urls import base_name, expand_urls
 
 MAX_RATIO = 100  # of the plain to the compressed size; photos hardly compress, a bomb of gzip has 1,000, one of zstd 30,000
@@ -61,7 +61,7 @@ def decompress(
         raise FileExistsError(f"{there} is there already; choose another folder, or allow to overwrite")
     folder.mkdir(parents=True, exist_ok=True)
     for url, target in zip(
-        tqdm(sources, desc="decompressing", unit="shard", disable=None if progress is None else not progress), targets, strict=True
+        Progress(sources, desc="decompressing", unit="shard", disable=None if progress is None else not progress), targets, strict=True
     ):
         partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
         try:

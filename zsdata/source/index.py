@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
+from zsdata.progress import Progress
 from zsdata.source.archive import MAX_PHOTO_BYTES, DepthMember, Problem, header_inside, photo_members
 from zsdata.source.ranges import ShardFile
 from zsdata.source.retry import Stamp
@@ -124,7 +123,7 @@ def write_index(urls: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
         ValueError, FileNotFoundError: as `expand_urls` raises them.
     """
     report = IndexReport()
-    for url in tqdm(expand_urls(urls), desc="indexing", unit="shard", disable=None if progress is None else not progress):
+    for url in Progress(expand_urls(urls), desc="indexing", unit="shard", disable=None if progress is None else not progress):
         try:
             listing, unchanged = load_listing(url), True
         except StaleIndex:

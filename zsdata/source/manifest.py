@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from zsdata.faults import BadPhoto
+from zsdata.progress import Progress
 from zsdata.source.archive import Problem, header_inside
 from zsdata.source.index import CHANGED_BYTES, CHANGED_DEPTH, CHECKSUM_UNKNOWN, NO_DEPTH, load_or_list
 from zsdata.source.ranges import ShardFile, read_range
@@ -147,7 +147,7 @@ def build_manifest(urls: str | os.PathLike[str] | Sequence[str | os.PathLike[str
     stale: list[str] = []
     hidden = not (progress or (len(shard_urls) > 1 and sys.stderr.isatty()))
     listings = load_or_list(shard_urls, stale)
-    for number, listing in enumerate(tqdm(listings, desc="indexing", unit="shard", total=len(shard_urls), disable=hidden)):
+    for number, listing in enumerate(Progress(listings, desc="indexing", unit="shard", total=len(shard_urls), disable=hidden)):
         shard_sizes.append(listing.size)
         stamps.append(listing.stamp)
         problems += listing.problems

@@ -10,9 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
-from tqdm import tqdm
-
 from zsdata.faults import BadPhoto
+from zsdata.progress import Progress
 from zsdata.source.archive import DEPTH_EXTENSIONS, MAX_PHOTO_BYTES, OTHER_IMAGE_EXTENSIONS, PHOTO_EXTENSIONS
 from zsdata.source.depth_map import DepthMap, decode_depth
 from zsdata.source.index import INDEX_ENDING
@@ -72,7 +71,7 @@ def pack(
     target.mkdir(parents=True, exist_ok=True)
     report, keys = PackReport(), set()
     with _Shards(target, name, photos_per_shard) as shards:
-        for path in tqdm(photos, desc="packing", unit="photo", disable=None if progress is None else not progress):
+        for path in Progress(photos, desc="packing", unit="photo", disable=None if progress is None else not progress):
             try:
                 data, extension = _read_photo(source / path)
             except BadPhoto as fault:

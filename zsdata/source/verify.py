@@ -7,9 +7,8 @@ import zlib
 from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, field
 
-from tqdm import tqdm
-
 from zsdata.faults import BadPhoto, BadShard
+from zsdata.progress import Progress
 from zsdata.source.archive import DepthMember, Problem, photo_members
 from zsdata.source.depth_map import DepthMap, misfit
 from zsdata.source.index import CHANGED_BYTES, CHANGED_DEPTH, NO_DEPTH, StaleIndex, load_listing
@@ -61,7 +60,7 @@ def verify(
         if on_problem is not None:
             on_problem(problem)
 
-    with tqdm(desc="verifying", unit="photo", disable=None if progress is None else not progress) as bar:
+    with Progress(desc="verifying", unit="photo", disable=None if progress is None else not progress) as bar:
         for number, url in enumerate(shard_urls, start=1):
             bar.set_postfix_str(f"shard {number} of {len(shard_urls)}: {base_name(url)}")
             before = report.photos + len(report.problems)
