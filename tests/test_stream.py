@@ -280,6 +280,8 @@ def test_an_inpainter_that_fails_is_told_so(tar):
         next(iter(open_stream(tar, inpaint=lambda right, mask, generators: right * float("nan"))))
     with pytest.raises(ValueError, match="must return"):
         next(iter(open_stream(tar, inpaint=lambda right, mask, generators: right[..., 1:])))
+    with pytest.raises(ValueError, match="the inpainter must return its images on cpu, where it gets them; got meta"):
+        next(iter(open_stream(tar, inpaint=lambda right, mask, generators: right.to("meta"))))
 
 
 def test_a_depth_estimator_that_fails_names_the_sample(tar):
@@ -288,6 +290,8 @@ def test_a_depth_estimator_that_fails_names_the_sample(tar):
 
     with pytest.raises(RuntimeError, match=r'sample 0 of epoch 0 \(source "photos", "0000\d\d" in .*photos.tar\) failed: out of luck'):
         next(iter(open_stream(tar, depth=broken)))
+    with pytest.raises(RuntimeError, match=r"sample 0 .* must return its maps on cpu, where the photos are; got meta"):
+        next(iter(open_stream(tar, depth=lambda images: images[:, :1].to("meta"))))
 
 
 @pytest.mark.parametrize(

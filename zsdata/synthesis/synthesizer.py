@@ -155,4 +155,6 @@ def _checked(inverse_depth: Tensor, photos: Tensor) -> Tensor:
     expected = (photos.shape[0], 1, *photos.shape[2:])
     if tuple(inverse_depth.shape) != expected:
         raise ValueError(f"the depth estimator must return [B, 1, H, W] = {list(expected)}; got {list(inverse_depth.shape)}")
+    if inverse_depth.device != photos.device:
+        raise ValueError(f"the depth estimator must return its maps on {photos.device}, where the photos are; got {inverse_depth.device}")
     return inverse_depth

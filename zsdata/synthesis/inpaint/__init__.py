@@ -77,7 +77,7 @@ def fill(
     inpainter gets all samples at once: one that knows what fits into memory divides them itself.
 
     Raises:
-        ValueError: where the inpainter returns another shape or values that are not finite.
+        ValueError: where the inpainter returns another shape, another device or values that are not finite.
     """
     filled = right.clone()
     with_holes = inpaint_mask.flatten(1).any(1).nonzero().flatten().tolist()
@@ -88,6 +88,8 @@ def fill(
         made = inpainter(right[part], inpaint_mask[part], [generators[i] for i in part], **extra)
         if made.shape != right[part].shape:
             raise ValueError(f"the inpainter must return {list(right[part].shape)}; got {list(made.shape)}")
+        if made.device != right.device:
+            raise ValueError(f"the inpainter must return its images on {right.device}, where it gets them; got {made.device}")
         if not torch.isfinite(made).all():
             raise ValueError("the inpainter returned NaN or infinity; in half precision try bfloat16 or float32")
         filled[part] = torch.where(inpaint_mask[part], made.float().clamp(0, 255), right[part])
