@@ -222,72 +222,74 @@ def train(
         return results
 
     results: dict[str, list[dict[str, Any]]] = {}
-    progress = Progress(total=config.steps, initial=step, unit="step", disable=not accelerator.is_main_process, dynamic_ncols=True)
-    mark = _Mark(step, loader.stats()["seconds"].get("wait", 0.0))
-    saved_step, judged_step = step, None
-    if validation.sets and config.evaluate_first and step == 0:
-        results = judge()
-        judged_step = step
-    while step < config.steps:
-        for batch in loader:
-            with accelerator.accumulate(model):
-                with accelerator.autocast():
-                    initial, sequence = model(batch.left, batch.right, iterations=config.iterations)
-                loss, metrics = loss_function(initial, sequence, batch)
-                guard.watch(loss, batch)
-                accelerator.backward(loss)
-                refused = False
-                if accelerator.sync_gradients:
-                    norm = accelerator.clip_grad_norm_(model.parameters(), config.clip_norm)
-                    refused = guard.refuses(step, cast(Tensor, norm))
-                    if refused:
-                        optimizer.zero_grad()  # a step without gradients changes nothing
-                optimizer.step()
-                optimizer.zero_grad()
-            if not accelerator.sync_gradients:
-                continue
-            schedule.step()
-            step += 1
-            if average is not None and not refused:
-                average.update(matcher, step)
-            progress.update()
-            if step % LOG_EVERY_STEPS == 0 or step == config.steps:
-                if step % RECONSTRUCT_EVERY_STEPS == 0:
-                    metrics |= _reconstruction(batch)
-                names, numbers = list(metrics), torch.stack([torch.as_tensor(value).float() for value in metrics.values()])
-                values = {
-                    "loss": guard.loss,
-                    **dict(zip(names, mean_over_ranks(numbers).tolist(), strict=True)),
-                    "gradient_norm": guard.gradient_norm,
-                    "skipped_steps": guard.skipped,
-                    "learning_rate": schedule.get_last_lr()[0],
-                }
-                pairs_seen = (step - mark.step) * config.batch_size * config.accumulate * accelerator.num_processes
-                wait = loader.stats()["seconds"].get("wait", 0.0)
-                values |= mark.rates(pairs_seen, wait)
-                mark = _Mark(step, wait)
-                progress.set_postfix_str(
-                    f"loss {values['loss']:.2f}, EPE {values['epe']:.2f} px, {values['pairs_per_second']:.1f} pairs/s, "
-                    f"waiting {values['wait_share']:.0%}"
-                )
-                if accelerator.is_main_process:
-                    place = loader.state_dict()
-                    _append(output / "log.jsonl", {"step": step, "epoch": place["epoch"], "samples": place["samples"], **values})
-                accelerator.log(values, step=step)
-            if validation.sets and config.evaluate_every is not None and step % config.evaluate_every == 0:
-                results = judge()
-                saved_step = judged_step = step
-            elif step % config.save_every == 0:
-                save()
-                saved_step = step
-            if step == config.steps:
-                break
-    progress.close()
-    if validation.sets and judged_step != step:
-        results = judge()
-    elif saved_step != step:
-        save()
-    loader.close()
+    with (
+        loader,
+        Progress(total=config.steps, initial=step, unit="step", disable=not accelerator.is_main_process, dynamic_ncols=True) as progress,
+    ):
+        mark = _Mark(step, loader.stats()["seconds"].get("wait", 0.0))
+        saved_step, judged_step = step, None
+        if validation.sets and config.evaluate_first and step == 0:
+            results = judge()
+            judged_step = step
+        while step < config.steps:
+            for batch in loader:
+                with accelerator.accumulate(model):
+                    with accelerator.autocast():
+                        initial, sequence = model(batch.left, batch.right, iterations=config.iterations)
+                    loss, metrics = loss_function(initial, sequence, batch)
+                    guard.watch(loss, batch)
+                    accelerator.backward(loss)
+                    refused = False
+                    if accelerator.sync_gradients:
+                        norm = accelerator.clip_grad_norm_(model.parameters(), config.clip_norm)
+                        refused = guard.refuses(step, cast(Tensor, norm))
+                        if refused:
+                            optimizer.zero_grad()  # a step without gradients changes nothing
+                    optimizer.step()
+                    optimizer.zero_grad()
+                if not accelerator.sync_gradients:
+                    continue
+                schedule.step()
+                step += 1
+                if average is not None and not refused:
+                    average.update(matcher, step)
+                progress.update()
+                if step % LOG_EVERY_STEPS == 0 or step == config.steps:
+                    if step % RECONSTRUCT_EVERY_STEPS == 0:
+                        metrics |= _reconstruction(batch)
+                    names, numbers = list(metrics), torch.stack([torch.as_tensor(value).float() for value in metrics.values()])
+                    values = {
+                        "loss": guard.loss,
+                        **dict(zip(names, mean_over_ranks(numbers).tolist(), strict=True)),
+                        "gradient_norm": guard.gradient_norm,
+                        "skipped_steps": guard.skipped,
+                        "learning_rate": schedule.get_last_lr()[0],
+                    }
+                    pairs_seen = (step - mark.step) * config.batch_size * config.accumulate * accelerator.num_processes
+                    wait = loader.stats()["seconds"].get("wait", 0.0)
+                    values |= mark.rates(pairs_seen, wait)
+                    mark = _Mark(step, wait)
+                    progress.set_postfix_str(
+                        f"loss {values['loss']:.2f}, EPE {values['epe']:.2f} px, {values['pairs_per_second']:.1f} pairs/s, "
+                        f"waiting {values['wait_share']:.0%}"
+                    )
+                    if accelerator.is_main_process:
+                        place = loader.state_dict()
+                        _append(output / "log.jsonl", {"step": step, "epoch": place["epoch"], "samples": place["samples"], **values})
+                    accelerator.log(values, step=step)
+                if validation.sets and config.evaluate_every is not None and step % config.evaluate_every == 0:
+                    results = judge()
+                    saved_step = judged_step = step
+                elif step % config.save_every == 0:
+                    save()
+                    saved_step = step
+                if step == config.steps:
+                    break
+        progress.close()
+        if validation.sets and judged_step != step:
+            results = judge()
+        elif saved_step != step:
+            save()
     accelerator.end_training()
     return results
 

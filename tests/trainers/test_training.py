@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import psutil
 import pytest
 import torch
 from accelerate.state import AcceleratorState
@@ -99,7 +100,10 @@ class Handful:
     def stats(self):
         return {"seconds": {}}
 
-    def close(self):
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
         pass
 
 
@@ -126,6 +130,14 @@ def fails_at_call(number, loss):
         return loss(initial, sequence, batch)
 
     return failing
+
+
+def test_a_run_that_fails_leaves_no_process_though_its_error_is_kept(tar, tmp_path):
+    """As a notebook keeps the last one, with all that its frames know."""
+    before = set(psutil.Process().children())
+    with pytest.raises(RuntimeError, match="power cut") as kept:
+        run_training(tar, tmp_path / "run", config(steps=4, workers=2), loss=fails_at_call(1, PAPERS_LOSS))
+    assert set(psutil.Process().children()) <= before and kept.tb is not None
 
 
 @pytest.mark.parametrize(("accumulate", "workers"), [(1, 2), (2, 0)])
