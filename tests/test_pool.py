@@ -66,6 +66,7 @@ TROUBLES = {
     "loads slowly": lambda: time.sleep(9),
     "raises": lambda: raise_(BadPhoto("truncated", "street-7")),
     "raises oddly": lambda: raise_(OddError(1, 2)),
+    "opens workers": lambda: open_pool(),
     "nothing": lambda: None,
 }
 
@@ -197,6 +198,11 @@ def test_an_exception_arrives_as_itself_with_its_traceback():
 def test_an_exception_that_cannot_travel_arrives_by_name():
     error, _, _ = trouble("raises oddly")
     assert type(error) is RuntimeError and str(error) == "OddError: 1 and 2"
+
+
+def test_workers_of_a_worker_are_refused():
+    error, _, seconds = trouble("opens workers")
+    assert "not allowed to have children" in str(error) and seconds < LIMIT_SECONDS
 
 
 def keep_open(start, pipe):

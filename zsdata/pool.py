@@ -36,6 +36,14 @@ REQUEST_BYTES = 200_000  # the longest message that the socket takes
 _SET_PARENT_DEATH_SIGNAL = 1  # prctl
 _starting = threading.Lock()  # one fork at a time: two would copy each other's half-made channels, and filelock refuses the second one
 
+
+def _not_starting() -> None:
+    global _starting
+    _starting = threading.Lock()
+
+
+os.register_at_fork(after_in_child=_not_starting)  # a worker is forked while it is held
+
 Request = Sequence[tuple[int, int]]  # (epoch, index) of each sample of a batch
 
 
