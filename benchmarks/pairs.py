@@ -314,10 +314,10 @@ def print_end_to_end(photos: PhotoSet, workers: Sequence[int], device: torch.dev
 
 @torch.inference_mode()
 def whole_photos(photos: PhotoSet, count: int) -> list[tuple[Tensor, Tensor]]:
-    """Image float32 [1, 3, H, W] and raw inverse depth, uint16 [1, 1, H, W] as the cache keeps it, of the first photos."""
+    """Image uint8 [1, 3, H, W] and raw inverse depth, uint16 [1, 1, H, W] as the cache keeps it, of the first photos."""
     depth = load_depth("builtin")
-    images = [decode_photo(data)[None].float() for data in photos.jpegs[:count]]
-    return [(image, (normalize_inverse_depth(depth(image)) * NEAREST).round().int().to(torch.uint16)) for image in images]
+    images = [decode_photo(data)[None] for data in photos.jpegs[:count]]
+    return [(image, (normalize_inverse_depth(depth(image.float())) * NEAREST).round().int().to(torch.uint16)) for image in images]
 
 
 def to_disparity(inverse_depth: Tensor, view: View) -> Tensor:
@@ -377,8 +377,9 @@ def print_cuda(photos: PhotoSet, device: torch.device, repeats: int) -> dict[str
     def geometry(left: Tensor, inverse_depth: Tensor):
         return forward_warp(left, to_sharp(to_disparity(inverse_depth, view)))
 
-    on_cpu, here = geometry(left, inverse_depth), (left.to(device), inverse_depth.to(device))
-    on_gpu = geometry(*here)
+    here = left.to(device), inverse_depth.to(device)
+    on_cpu, on_gpu = (geometry(image.float(), depth) for image, depth in ((left, inverse_depth), here))  # before colours are rounded
+    geometry(*here)
     ms = []
     for _ in range(repeats):
         torch.cuda.synchronize(device)

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import cv2
 import torch
 from torch import Tensor
 
@@ -128,7 +127,7 @@ def make(draft: Draft, depth: DepthMaps, needs: Sequence[str], config: Synthesis
     Raises:
         BadPhoto: where the gate refuses it.
     """
-    made = synthesize(draft.left.unsqueeze(0).float(), depth, draft.view, draft.scale, config, meter)
+    made = synthesize(draft.left.unsqueeze(0), depth, draft.view, draft.scale, config, meter)
     width = draft.view.width - draft.view.margin
     context = dict(draft.context)
     if "right_disparity" in needs:
@@ -154,7 +153,7 @@ def make(draft: Draft, depth: DepthMaps, needs: Sequence[str], config: Synthesis
     }
     return Prepared(
         left=draft.left[..., :width].contiguous(),
-        right=_to_uint8(made.right[0]),
+        right=made.right[0].contiguous(),
         disparity=disparity,
         confidence=made.confidence[0].contiguous(),
         nonocclusion=nonocclusion,
@@ -164,13 +163,6 @@ def make(draft: Draft, depth: DepthMaps, needs: Sequence[str], config: Synthesis
         rejected=draft.rejected,
         seconds=draft.seconds,
     )
-
-
-def _to_uint8(image: Tensor) -> Tensor:
-    """float32 [C, H, W], 0..255, to uint8, rounded (half to even). On the CPU OpenCV rounds, three times as fast as torch."""
-    if image.device.type == "cpu":
-        return torch.from_numpy(cv2.convertScaleAbs(image.flatten(0, 1).numpy())).view(image.shape)
-    return image.round().to(torch.uint8)
 
 
 def _distinct(samples: Sequence[Any]) -> tuple[list[Any], list[int]]:

@@ -34,6 +34,21 @@ def test_zero_disparity_leaves_the_photo_as_it_is():
     assert warp.nonocclusion_mask.all() and not warp.inpaint_mask.any()
 
 
+def test_a_uint8_image_is_warped_as_its_float_and_rounded():
+    generator = torch.Generator().manual_seed(3)
+    left = torch.randint(0, 256, (2, 3, 24, 70), generator=generator, dtype=torch.uint8)
+    disparity = torch.rand((2, 1, 24, 70), generator=generator) * torch.tensor([1.5, 12]).view(2, 1, 1, 1)  # stretched, and torn
+    warp, as_float = forward_warp(left, disparity, columns=64), forward_warp(left.float(), disparity, columns=64)
+    assert warp.right.dtype == torch.uint8
+    assert torch.equal(warp.right, as_float.right.round().to(torch.uint8))
+    assert all(torch.equal(ours, theirs) for ours, theirs in zip(warp[1:], as_float[1:], strict=True))
+
+
+def test_other_whole_numbers_are_refused():
+    with pytest.raises(TypeError, match="uint8 or a float; got"):
+        forward_warp(torch.zeros(1, 3, 4, 8, dtype=torch.int32), torch.zeros(1, 1, 4, 8))
+
+
 def test_a_subpixel_shift_interpolates_between_the_two_pixels():
     left = torch.rand(1, 1, 1, 32) * 255
     warp = warp_one_row([3.25] * 32, left)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -139,6 +140,12 @@ class _Frame:
         """Without the frame."""
         return padded[..., NEAR_ROWS:-NEAR_ROWS, 1:-1]
 
+    def table(self, edge: Tensor, of_edge: Tensor, of_frame: int) -> Tensor:
+        """For all places, flattened: `of_edge` for the edges, `of_frame` for the frame, 0 for values."""
+        table = torch.full(self.padded.shape, of_frame, dtype=of_edge.dtype, device=edge.device)
+        self.inside(table).zero_()
+        return table.view(-1).index_copy_(0, edge, of_edge)
+
 
 def _nearest_values(edge: Tensor, frame: _Frame) -> Tensor:
     """Where each edge takes its value from. Places are indices into the flattened, padded maps, int64; those of the edges ascend."""
@@ -149,24 +156,20 @@ def _nearest_values(edge: Tensor, frame: _Frame) -> Tensor:
     before = edge.index_select(0, first) - 1
     after = edge.index_select(0, torch.cat((first[1:], first.new_tensor([edge.shape[0]]))) - 1) + 1
 
-    def columns_off(none: int, dtype: torch.dtype) -> tuple[Tensor, ...]:
-        """How far off the nearest value of its row is, on the left and on the right, for all places: `none` at most, 0 but for edges."""
-        off = torch.full((2, *frame.padded.shape), none, dtype=dtype, device=edge.device)
-        frame.inside(off).zero_()
-        sides = off.view(2, -1).unbind()
-        for side, beyond in zip(sides, (before, after), strict=True):
-            outside = side.index_select(0, beyond)
-            distance = (edge - beyond.index_select(0, run)).abs_().add_(outside.index_select(0, run))
-            side.index_copy_(0, edge, distance.clamp_(max=none).to(dtype))
-        return sides
+    def columns_off(none: int) -> tuple[Tensor, Tensor]:
+        """How far off the nearest value of its row is, on the left and on the right of each edge; `none` at most."""
+        left = before - (before % frame.columns == 0) * none  # the frame holds no values
+        right = after + (after % frame.columns == frame.columns - 1) * none
+        return (edge - left.index_select(0, run)).clamp_(max=none), (right.index_select(0, run) - edge).clamp_(max=none)
 
     # Near rows, all at once. Candidates stand in the order of preference at equal distance: nearer rows, the row above, the left one.
     row_steps = sorted(range(-NEAR_ROWS, NEAR_ROWS + 1), key=abs)
     there = (edge + frame.columns * edge.new_tensor(row_steps).unsqueeze(1)).flatten()
-    candidates = torch.stack([side.index_select(0, there) for side in columns_off(NOT_NEAR_PX, torch.int16)]).view(2, len(row_steps), -1)
     count = 2 * len(row_steps)
-    order = [[count * step**2 + 2 * place + side for place, step in enumerate(row_steps)] for side in (0, 1)]
-    key = candidates.square().mul_(count).add_(candidates.new_tensor(order).unsqueeze(-1)).amin((0, 1)).long()
+    left, right = columns_off(NOT_NEAR_PX)
+    best_of_row = frame.table(edge, torch.minimum(count * left * left, count * right * right + 1).to(torch.int16), count * NOT_NEAR_PX**2)
+    order = [count * step**2 + 2 * place for place, step in enumerate(row_steps)]
+    key = best_of_row.index_select(0, there).view(len(row_steps), -1).add_(best_of_row.new_tensor(order).unsqueeze(1)).amin(0).long()
     square = torch.div(key, count, rounding_mode="floor")
     choice = key.sub_(square, alpha=count)
     tables = [step for step in row_steps for _ in (0, 1)], [-1, 1] * len(row_steps)
@@ -177,11 +180,12 @@ def _nearest_values(edge: Tensor, frame: _Frame) -> Tensor:
     far = flat_indices(square > (NEAR_ROWS + 1) ** 2)
     if far.shape[0]:
         none = frame.columns  # farther than any value of the row
-        found[far] = _nearest_values_row_by_row(edge[far], columns_off(none, torch.int64), none, frame)
+        tables = [frame.table(edge, off, none) for off in columns_off(none)]
+        found[far] = _nearest_values_row_by_row(edge[far], tables, none, frame)
     return found
 
 
-def _nearest_values_row_by_row(edge: Tensor, columns_off: tuple[Tensor, ...], none: int, frame: _Frame) -> Tensor:
+def _nearest_values_row_by_row(edge: Tensor, columns_off: Sequence[Tensor], none: int, frame: _Frame) -> Tensor:
     """As `_nearest_values`, for some edges and at any distance; the edge itself where a map is edge all over."""
     found, distance = edge.clone(), torch.full_like(edge, frame.rows**2 + frame.columns**2)
     row = torch.div(edge, frame.columns, rounding_mode="floor") % frame.rows

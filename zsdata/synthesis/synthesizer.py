@@ -122,7 +122,7 @@ def synthesize(photo_view: Tensor, depth: DepthMaps, view: View, scale: float, c
     """The right view of one photo's view, with holes, and both masks.
 
     Args:
-        photo_view: float32 [1, 3, height, width], the view's part of the photo, margin included.
+        photo_view: uint8 [1, 3, height, width], RGB, the view's part of the photo, margin included.
         depth: of the photo, at least the rows that the view shows.
         view: where the crop lies in the photo.
         scale: disparity of the photo's nearest point as a share of its width.

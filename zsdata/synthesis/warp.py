@@ -18,9 +18,10 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -44,7 +45,7 @@ class Warped(NamedTuple):
     """What `forward_warp` returns; H is that of the left image, and so is W unless fewer columns are asked for.
 
     Attributes:
-        right: [B, C, H, W], dtype of `left`: the right view, 0 in its holes.
+        right: [B, C, H, W], dtype of `left`: the right view, 0 in its holes. Of a uint8 image rounded, half to even.
         inpaint_mask: bool [B, 1, H, W], right frame: True where no left pixel lands (a hole).
         nonocclusion_mask: bool [B, 1, H, W], left frame: True where the right camera sees this point.
         right_disparity: float32 [B, 1, H, W], right frame, pixels: right (u, y) is left (u + d, y); 0 in holes.
@@ -65,17 +66,20 @@ def forward_warp(left: Tensor, disparity: Tensor, columns: int | None = None) ->
     depends on the batch: a sample's result is the same bit for bit in any batch. Not differentiable: the results carry no gradient.
 
     Args:
-        left: float [B, C, H, W]; RGB 0..255 in the stream, any C and range here (the result is kept within the range of each image).
+        left: uint8 or float [B, C, H, W]; any C and, where it is float, any range (the result is kept within the range of each image).
         disparity: float [B, 1, H, W], pixels, left frame, >= 0. Zero leaves the photo as it is. A non-finite value covers nothing.
         columns: of the results, counted from the left; None for all W. What lies beyond them in `left` may land in them.
 
     Raises:
         ValueError: for shapes that do not fit each other, for a negative disparity, and for columns that `left` does not have.
+        TypeError: for an image of whole numbers other than uint8.
     """
     if left.ndim != 4 or disparity.ndim != 4 or 0 in left.shape or disparity.shape != (left.shape[0], 1, *left.shape[2:]):
         raise ValueError(
             f"it takes left [B, C, H, W] and disparity [B, 1, H, W] of one size, got {list(left.shape)} and {list(disparity.shape)}"
         )
+    if not (left.is_floating_point() or left.dtype == torch.uint8):
+        raise TypeError(f"left is uint8 or a float; got {left.dtype}")
     batch, channels, height, width = left.shape
     columns = width if columns is None else columns
     if not 1 <= columns <= width:
@@ -208,7 +212,7 @@ def _warp_part(planes: Tensor, disparity: Tensor, limits: list[list[float]], gri
     """Warps whole rows.
 
     Args:
-        planes: [C, N], of one image or, where there is more than one limit, of as many.
+        planes: [C, N], uint8 or float, of one image or, where there is more than one limit, of as many.
         disparity: [N].
         limits: least and largest value of each image.
         out: what is filled in: right [C, M], masks [rows, columns], right_disparity [M], for M = rows * columns.
@@ -225,7 +229,8 @@ def _warp_part(planes: Tensor, disparity: Tensor, limits: list[list[float]], gri
 
     shown = memory.take(1 + count + special.share.shape[0])  # as in `_colours`
     shown[0] = 0
-    torch.lerp(disparity, surfaces.following, surfaces.share, out=shown[1 : 1 + count])
+    torch.lerp(disparity[:-1], disparity[1:], surfaces.share[:-1], out=shown[1:count])
+    shown[count] = disparity[-1]
     shown[1 + count :] = special.disparity
     torch.index_select(shown, 0, source, out=out.right_disparity)
     memory.used = used
@@ -239,7 +244,6 @@ class _Surfaces(NamedTuple):
     """The surfaces that N pixels lie on, and where they land.
 
     Attributes:
-        following: float32 [N], px, the right neighbour's disparity; 0 in the last column.
         joined: float32 [N + 2], 1 where the pixel and its left neighbour are of one surface, else 0; 0 at N and N + 1.
         share: float32 [N], how far from the pixel (0) to its right neighbour (1) the point lies that lands on the first column at or right
             of x'; 0 where they are two surfaces.
@@ -249,7 +253,6 @@ class _Surfaces(NamedTuple):
             the pixel's first at or right of x' is not the neighbour's.
     """
 
-    following: Tensor
     joined: Tensor
     share: Tensor
     landing: Tensor
@@ -259,12 +262,12 @@ class _Surfaces(NamedTuple):
 
 def _surfaces(disparity: Tensor, grid: _Grid, memory: _Memory) -> _Surfaces:
     count = grid.count
-    following, share, joined = memory.take(count), memory.take(count), memory.take(count + 2)
+    share, joined = memory.take(count), memory.take(count + 2)
     landing, nearest = memory.take(count, torch.int32), memory.take(grid.cells, torch.int32)
     used = memory.used
-    following[:-1] = disparity[1:]
-    following.view(-1, grid.width)[:, -1] = 0
-    drop = torch.sub(disparity, following, out=share)
+    drop = share  # to the right neighbour
+    torch.sub(disparity[:-1], disparity[1:], out=drop[:-1])
+    drop.view(-1, grid.width)[:, -1] = 0
     joined[0] = joined[-1] = 0
     same = torch.abs(drop, out=joined[1:-1]).le_(LARGEST_STEP_PX)  # 1 or 0: comparisons of floats in place are the fastest
     same.view(-1, grid.width)[:, -1] = 0
@@ -272,7 +275,10 @@ def _surfaces(disparity: Tensor, grid: _Grid, memory: _Memory) -> _Surfaces:
     # A pixel covers the first column at or right of x' unless its neighbour on the same surface lands at or left of that column, too. The
     # right end of a surface, which reaches half a pixel far, is left to `_special`.
     whole = torch.floor(disparity, out=memory.take(count))
-    rise = torch.floor(following, out=memory.take(count)).sub_(whole).mul_(same)
+    rise = memory.take(count)
+    torch.sub(whole[1:], whole[:-1], out=rise[:-1])
+    rise[-1] = 0
+    rise.mul_(same)
     covers = torch.clamp(rise, -1, 0, out=memory.take(count)).add_(same)
     simple = memory.take(count + 1, torch.bool)
     simple[0] = False
@@ -288,7 +294,7 @@ def _surfaces(disparity: Tensor, grid: _Grid, memory: _Memory) -> _Surfaces:
     landing.sub_(place.copy_(fraction.sub_(0.5).add_(odd, alpha=TIE_PX).ceil_()))
     breaks = flat_indices(simple.logical_not_())
     memory.used = used
-    return _Surfaces(following, joined, share, landing, nearest, breaks)
+    return _Surfaces(joined, share, landing, nearest, breaks)
 
 
 class _Special(NamedTuple):
@@ -311,7 +317,7 @@ def _special(disparity: Tensor, surfaces: _Surfaces, grid: _Grid) -> _Special:
     The right end of a surface covers its first column at or right of x' where that is half a pixel away at most. The left end covers the
     column before its own where that is half a pixel away at most, and behind a stretched step the pixel covers it in any case.
     """
-    _, joined, _, _, nearest, breaks = surfaces
+    joined, nearest, breaks = surfaces.joined, surfaces.nearest, surfaces.breaks
     inner = joined.index_select(0, breaks)  # 1 on a stretched step, 0 between two surfaces
     ends, begins = breaks[1:] - 1, breaks[:-1]
     count = ends.shape[0]
@@ -331,45 +337,59 @@ def _special(disparity: Tensor, surfaces: _Surfaces, grid: _Grid) -> _Special:
     nearest.scatter_reduce_(0, cell, wins.mul_(number), "amax")
 
     source = begins - inner.long()
-    here, following = disparity.index_select(0, source), surfaces.following.index_select(0, source)
+    here, following = disparity.index_select(0, source), own[count:]  # the same where nothing joins them
     share = (here - whole).div_((here - following).add_(1)).clamp_(0, 1).mul_(inner)
     return _Special(source, share, torch.lerp(here, following, share))
 
 
 def _colours(planes: Tensor, surfaces: _Surfaces, special: _Special, limits: list[list[float]], memory: _Memory) -> Iterator[Tensor]:
     """For each channel a zero for the holes, the colours that the N pixels show, and those of the special ones; [1 + N + S]."""
-    count = planes.shape[1]
+    count, dtype = planes.shape[1], _arithmetic(planes)
     others = _special_colours(planes, surfaces.joined, special, limits)
     weights = _Weights(*(memory.take(count) for _ in range(3)))
-    weights = weights.fill(surfaces.share, surfaces.joined[:-2], surfaces.joined[2:]).to(planes.dtype)
-    change = memory.take(count + 2, planes.dtype)  # from the left neighbour; the outermost have no weight
+    weights = weights.fill(surfaces.share, surfaces.joined[:-2], surfaces.joined[2:]).to(dtype)
+    values, change = memory.take(count, dtype), memory.take(count + 2, dtype)  # and changes from the left neighbour; the outermost have no weight
     change[0] = 0
     change[-2:] = 0
     changes = change[:-2], change[1:-1], change[2:]
-    colours = memory.take(1 + count + special.share.shape[0], planes.dtype)
+    colours, rounded = (memory.take(1 + count + special.share.shape[0], kind) for kind in (dtype, planes.dtype))
     colours[0] = 0
     ordinary = colours[1 : 1 + count]
     for plane, other in zip(planes, others, strict=True):
-        torch.sub(plane[1:], plane[:-1], out=change[1:-2])
-        weights.cubic(plane, changes, out=ordinary)
+        values.copy_(plane)
+        torch.sub(values[1:], values[:-1], out=change[1:-2])
+        weights.cubic(values, changes, out=ordinary)
         for image, (least, largest) in zip(ordinary.view(len(limits), -1), limits, strict=True):
             image.clamp_(least, largest)
         colours[1 + count :] = other
-        yield colours
+        yield colours if planes.is_floating_point() else _round(colours, out=rounded)
+
+
+def _arithmetic(image: Tensor) -> torch.dtype:
+    """In which its colours are computed."""
+    return image.dtype if image.is_floating_point() else torch.float32
+
+
+def _round(values: Tensor, out: Tensor) -> Tensor:
+    """float32 [N], 0..255, to uint8, half to even. On the CPU OpenCV rounds, three times as fast as torch."""
+    if values.device.type == "cpu":
+        cv2.convertScaleAbs(values.numpy(), dst=out.numpy())
+        return out
+    return out.copy_(values.round())
 
 
 def _special_colours(planes: Tensor, joined: Tensor, special: _Special, limits: list[list[float]]) -> Tensor:
     """[C, S]."""
     source, share, _ = special
     weights = _Weights(*(torch.empty_like(share) for _ in range(3)))
-    weights = weights.fill(share, joined.index_select(0, source), joined.index_select(0, source + 2)).to(planes.dtype)
-    places = [(source + step).clamp_(0, planes.shape[1] - 1) for step in (-1, 0, 1, 2)]
-    before, here, following, beyond = (torch.stack([plane.index_select(0, place) for plane in planes]) for place in places)
-    colours = weights.cubic(here, (here - before, following - here, beyond - following), out=before)
+    weights = weights.fill(share, joined.index_select(0, source), joined.index_select(0, source + 2)).to(_arithmetic(planes))
+    places = (source + torch.arange(-1, 3, device=source.device).unsqueeze(1)).clamp_(0, planes.shape[1] - 1).flatten()
+    taps = torch.stack([plane.index_select(0, places) for plane in planes]).to(_arithmetic(planes)).view(len(planes), 4, -1)
+    colours = weights.cubic(taps[:, 1], taps.diff(dim=1).unbind(1))
     if len(limits) == 1:
         return colours.clamp_(*limits[0])
     image = torch.div(source, planes.shape[1] // len(limits), rounding_mode="floor")
-    return colours.clamp_(*planes.new_tensor(limits).index_select(0, image).unbind(1))
+    return colours.clamp_(*colours.new_tensor(limits).index_select(0, image).unbind(1))
 
 
 class _Weights(NamedTuple):
@@ -396,9 +416,9 @@ class _Weights(NamedTuple):
     def to(self, dtype: torch.dtype) -> _Weights:
         return _Weights(*(weight.to(dtype) for weight in self))
 
-    def cubic(self, here: Tensor, changes: tuple[Tensor, Tensor, Tensor], out: Tensor) -> Tensor:
+    def cubic(self, here: Tensor, changes: Sequence[Tensor], out: Tensor | None = None) -> Tensor:
         """The colour, from p(i) and the three changes."""
-        torch.addcmul(here, self.before, changes[0], value=SHARPNESS, out=out)
+        out = torch.addcmul(here, self.before, changes[0], value=SHARPNESS, out=out)
         return out.addcmul_(self.between, changes[1]).addcmul_(self.after, changes[2], value=-SHARPNESS)
 
 
