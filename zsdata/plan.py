@@ -7,6 +7,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import accumulate
 from typing import NamedTuple
 
@@ -50,6 +51,12 @@ class Shuffle:
         return high << self._half_bits | low
 
 
+@lru_cache(maxsize=256)
+def _shuffle(size: int, *key: int | str) -> Shuffle:
+    """Those of an epoch, which all its samples ask for."""
+    return Shuffle(size, *key)
+
+
 def _mix(value: int) -> int:
     """A 64-bit finalizer (the constants are splitmix64's): every bit of the result depends on every bit of the value."""
     value = (value ^ (value >> 30)) * 0xBF58476D1CE4E5B9 & 0xFFFFFFFFFFFFFFFF
@@ -90,12 +97,12 @@ class EpochPlan:
         """The photo of sample `index` of `epoch`."""
         if not 0 <= index < self.epoch_size:
             raise IndexError(f"sample {index} of an epoch of {self.epoch_size}")
-        place = Shuffle(sum(self.quotas), self.seed, "mix", epoch)(index // self.samples_per_photo)
+        place = _shuffle(sum(self.quotas), self.seed, "mix", epoch)(index // self.samples_per_photo)
         ends = list(accumulate(self.quotas))
         source = bisect_right(ends, place)
         turn = epoch * self.quotas[source] + place - (ends[source] - self.quotas[source])
         rounds, position = divmod(turn, self.sizes[source])
-        return Choice(source, Shuffle(self.sizes[source], self.seed, "order", self.names[source], rounds)(position))
+        return Choice(source, _shuffle(self.sizes[source], self.seed, "order", self.names[source], rounds)(position))
 
     def spare(self, epoch: int, index: int, attempt: int) -> Choice | None:
         """The photo that stands in when the first choice and `attempt` spares before it could not be used; None when all have been tried.

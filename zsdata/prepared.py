@@ -134,7 +134,7 @@ def make(draft: Draft, depth: DepthMaps, needs: Sequence[str], config: Synthesis
         context["right_disparity"] = made.right_disparity[0].contiguous()
     hole = made.inpaint_mask[..., :width]
     disparity, nonocclusion = made.disparity[0].contiguous(), made.nonocclusion_mask[0].contiguous()
-    least, largest = (float(value) for value in disparity.aminmax())
+    least, largest = float(disparity.amin()), float(disparity.amax())
     hole_share = count_true(hole) / hole.numel()
     reason = gate.refuses(
         hole_share=hole_share,

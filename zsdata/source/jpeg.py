@@ -88,7 +88,7 @@ class Jpeg:
             reduction: 1, 2, 4 or 8: decoded at one part in so many of each side, rounded up.
         """
         image = decode_color(self.data, reduction)
-        if self.components < 4 and (image[-1, -1] == 128).all() and self._lacks_scan_data(image, reduction):
+        if self.components < 4 and set(image[-1, -1].tolist()) == {128} and self._lacks_scan_data(image, reduction):
             raise BadPhoto("truncated: JPEG data are missing before its end")
         if (
             self.data.find(_ZEROS, self.scan) >= 0  # quick, and hardly any photo has them
