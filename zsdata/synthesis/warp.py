@@ -30,7 +30,7 @@ from zsdata.synthesis.indices import flat_indices
 
 CPU_PART_PX = 262_144  # warped at once on the CPU: what is between the steps stays in its cache
 PART_PX = 2**28  # elsewhere; pixels are numbered by int32
-BYTES_PER_PX = 72  # of what is between the steps
+BYTES_PER_PX = 64  # of what is between the steps
 RECYCLED_BYTES = 31 * 2**20  # glibc keeps freed memory for its next use as far as the largest block that was ever freed, 32 MiB at most
 ALIGNED_BYTES = 64  # a cache line, on which tensors begin
 # Of the cubic that resamples colours. At 1/2 it is Catmull-Rom's; at 1 a shift by half a pixel leaves the right view as sharp as the left
@@ -91,9 +91,8 @@ def forward_warp(left: Tensor, disparity: Tensor, columns: int | None = None) ->
     part_px, images_at_once = (CPU_PART_PX, 1) if left.device.type == "cpu" else (PART_PX, max(1, min(batch, PART_PX // (height * width))))
     parts_of_image = -(-height * width // part_px)
     rows_at_once = -(-height // parts_of_image)
-    memory = _Memory.get(BYTES_PER_PX * images_at_once * rows_at_once * width, left.device)
-    grid = _Grid.make(images_at_once * rows_at_once, width, columns, int(largest) + 2, memory)
-    used = memory.used
+    grid = _Grid.make(images_at_once * rows_at_once, width, columns, reach=int(largest) + 2, device=left.device)
+    memory = _Memory.get(BYTES_PER_PX * grid.count, left.device)
     right = _fresh((channels, batch, height, columns), left.dtype, left.device)
     right_disparity = _fresh((batch, height, columns), torch.float32, left.device)
     hole, seen = (_fresh((batch, height, columns), torch.bool, left.device) for _ in range(2))
@@ -103,7 +102,7 @@ def forward_warp(left: Tensor, disparity: Tensor, columns: int | None = None) ->
             out = Warped(
                 right[:, images, rows].flatten(1), hole[part].flatten(0, 1), seen[part].flatten(0, 1), right_disparity[part].flatten()
             )
-            memory.used = used
+            memory.used = 0
             _warp_part(left.transpose(0, 1)[:, images, rows].flatten(1), disparity[:, 0][part].flatten(), limits[images], grid, memory, out)
     return Warped(right.transpose(0, 1).contiguous(), hole.unsqueeze(1), seen.unsqueeze(1), right_disparity.unsqueeze(1))
 
@@ -129,7 +128,8 @@ class _Memory:
 
     def __init__(self, size: int, device: torch.device) -> None:
         self._size = size
-        self._block = _fresh((size,), torch.uint8, device)
+        block = _fresh((-(-size // ALIGNED_BYTES) * ALIGNED_BYTES,), torch.uint8, device)
+        self._as = {dtype: block.view(dtype) for dtype in (torch.uint8, torch.bool, torch.int32, torch.int64, torch.float32)}
         self.device = device
         self.used = 0  # bytes; set it back to give back what was taken since
 
@@ -142,17 +142,16 @@ class _Memory:
         if kept is None or kept._size < size:
             np.empty(RECYCLED_BYTES, np.uint8)  # never touched, and given back at once
             kept = cls._kept.memory = cls(size, device)
-        kept.used = 0
         return kept
 
     def take(self, count: int, dtype: torch.dtype = torch.float32) -> Tensor:
         """[count], with anything in it."""
         start = -(-self.used // ALIGNED_BYTES) * ALIGNED_BYTES
         end = start + count * dtype.itemsize
-        if end > self._size:  # images in float64, or hardly two neighbours on one surface
+        if end > self._size or dtype not in self._as:  # images in float64 or in half, or hardly two neighbours on one surface
             return torch.empty(count, dtype=dtype, device=self.device)
         self.used = end
-        return self._block[start:end].view(dtype)
+        return self._as[dtype][start // dtype.itemsize : end // dtype.itemsize]
 
 
 def _within_reach(disparity: Tensor, width: int) -> tuple[Tensor, float]:
@@ -188,15 +187,14 @@ class _Grid(NamedTuple):
     cell: Tensor
 
     @staticmethod
-    def make(rows: int, width: int, columns: int, reach: int, memory: _Memory) -> _Grid:
+    def make(rows: int, width: int, columns: int, reach: int, device: torch.device) -> _Grid:
         margin = max(reach, width - columns)
         margin += margin % 2
         stride = margin + columns + columns % 2
-        row, column = (torch.arange(count, dtype=torch.int32, device=memory.device) for count in (rows, width))
-        place, cell = (memory.take(rows * width, torch.int32) for _ in range(2))
-        torch.add((row * width).unsqueeze(1), column + 1, out=place.view(rows, width))
-        torch.add((row * stride).unsqueeze(1), column + margin, out=cell.view(rows, width))
-        return _Grid(rows * width, width, columns, margin, stride, place, cell)
+        row, column = (torch.arange(count, dtype=torch.int32, device=device) for count in (rows, width))
+        place = (row * width).unsqueeze(1) + (column + 1)
+        cell = (row * stride).unsqueeze(1) + (column + margin)
+        return _Grid(rows * width, width, columns, margin, stride, place.flatten(), cell.flatten())
 
     def first(self, count: int) -> _Grid:
         """The grid of the first `count` pixels."""
