@@ -4,15 +4,16 @@ python benchmarks/reprojection.py                                   the photos t
 python benchmarks/reprojection.py --photos DIR [--every N]          a folder of photos, every Nth of them
 python benchmarks/reprojection.py --stereo DIR                      also pairs with ground truth (see trainers/pairs_on_disk.py)
 
-Photos: whole, at full resolution. Built-in depth, disparity dilated and sharpened as the stream does, its largest value 0.03, 0.05 and
-0.10 of the width (small; the lower end and the centre of what most draws are), then as the stream draws it. The right image is looked up
+Photos: whole, at full resolution. Built-in depth, disparity dilated and sharpened as the stream does, its largest value 0.03, 0.05 and 0.10
+of the width (small; the lower end and the centre of what most draws are), then as the stream draws it. The right image is looked up
 bilinearly at x - d and compared with the left one, in 0..1: mean absolute error, SSIM (7x7 windows, borders reflected), and the photometric
 loss 0.85 (1 - SSIM) / 2 + 0.15 AbsErr; means over the photos. "Visible" are the non-occluded pixels whose lookup reads no invented pixel;
 "whole" are all, with the holes filled by the built-in inpainter and the frame's border repeated: what leaves the frame or is occluded
 cannot be found there by any warp, and it grows with the disparity. The paper gives 0.025, 0.850, 0.068 for its own pairs (whole images,
-other photos and depth) and 0.082, 0.269, 0.323 for StereoDiffusion. "Bilinear" and "nearest pixel" are references with the geometry and the masks of `forward_warp`: the left image is read at u + d of the right image's disparity, between its
-two neighbours or at the nearer one. Their time is that of `forward_warp` and this lookup; "decodes" are multiples of decoding the photo
-from JPEG. A second table says where the error comes from.
+other photos and depth) and 0.082, 0.269, 0.323 for StereoDiffusion. "Bilinear" and "nearest pixel" are references with the geometry and the
+masks of `forward_warp`: the left image is read at u + d of the right image's disparity, between its two neighbours or at the nearer one.
+Their time is that of `forward_warp` and this lookup; "decodes" are multiples of decoding the photo from JPEG. A second table says where the
+error comes from.
 
 Pairs: the left image is warped with the true disparity and compared with the true right image where something was warped to. "Floor" is the
 true right image, looked up bilinearly from the left: what the cameras, and not the warp, make different, on the same scene points. Where a

@@ -1,8 +1,12 @@
-"""The benchmark of the tiers runs on small networks, so that it will on large ones."""
+"""The benchmarks of the tiers run on small networks, so that they will on large ones."""
 
+import importlib
 import json
+import sys
+from pathlib import Path
 
 import pytest
+import torch
 
 pytest.importorskip("diffusers")
 
@@ -17,3 +21,38 @@ def test_the_smoke_run_measures_every_tier(tmp_path, capsys):
     assert all(row["pairs_per_second"] > 0 for row in figures["inpainting"])
     assert figures["depth"][0]["photos_per_second"] > 0
     assert "4 steps" in capsys.readouterr().out
+
+
+@pytest.fixture
+def inpainting_memory(monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
+    yield importlib.import_module("inpainting_memory")
+    for name in ("inpainting_memory", "tiers"):
+        sys.modules.pop(name)
+
+
+def test_memory_is_counted_while_a_tensor_lives_and_once_for_all_its_views(inpainting_memory):
+    given = torch.zeros(1000)
+    with inpainting_memory.LiveBytes() as live:
+        given.view(10, 100).add_(1)
+        assert live.peak == 0
+        made = given + 1
+        assert live.peak == 4000
+        halves = made[:500], made[500:]
+        doubled = made * 2
+        assert live.peak == 8000
+        del made, doubled
+        other = torch.zeros(500)  # the halves keep theirs alive
+        assert live.peak == 8000
+        del halves, other
+        torch.zeros(2000)
+        assert live.peak == 8000
+        torch.zeros(2001)
+        assert live.peak == 8004
+
+
+def test_the_smoke_run_counts_the_memory_of_every_stage(inpainting_memory, capsys):
+    inpainting_memory.main(["--smoke", "--size", "64", "96", "--micro-batch", "2"])
+    header, full, tiny = (line.split() for line in capsys.readouterr().out.splitlines()[-3:])
+    assert header == ["autoencoder", "weights", "encode", "U-Net", "decode", "all", "target"]
+    assert [full[0], tiny[0]] == ["full", "tiny"]

@@ -350,7 +350,8 @@ def _colours(planes: Tensor, surfaces: _Surfaces, special: _Special, limits: lis
     others = _special_colours(planes, surfaces.joined, special, limits)
     weights = _Weights(*(memory.take(count) for _ in range(3)))
     weights = weights.fill(surfaces.share, surfaces.joined[:-2], surfaces.joined[2:]).to(dtype)
-    values, change = memory.take(count, dtype), memory.take(count + 2, dtype)  # and changes from the left neighbour; the outermost have no weight
+    values = memory.take(count, dtype)
+    change = memory.take(count + 2, dtype)  # from the left neighbour; the outermost have no weight
     change[0] = 0
     change[-2:] = 0
     changes = change[:-2], change[1:-1], change[2:]

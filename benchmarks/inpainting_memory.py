@@ -1,0 +1,111 @@
+"""Which GPU does diffusion inpainting fit on? The memory of a micro-batch, counted tensor by tensor; no GPU needed.
+
+    python benchmarks/inpainting_memory.py                  # full-size networks on the CPU, two minutes and 8 GB of memory
+    python benchmarks/inpainting_memory.py --smoke          # small networks: does it run at all
+
+Stable Diffusion 2 Inpainting's U-Net and autoencoder with random weights, as in tiers.py, make two steps with real tensors in bf16. Counted
+are the bytes of all tensors that are alive at once, which no GPU can do without; a run on one also takes the workspaces of its kernels,
+what its allocator loses to fragments, and the context of CUDA. Where there is a GPU, tiers.py measures what they take together.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import diffusers
+import torch
+import transformers
+from tiers import MEMORY_TARGET_GIB, gib, print_row, save_pipeline
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from zsdata import load_inpainter
+from zsdata.synthesis.inpaint.diffusion import DiffusionInpainter
+from zsdata.synthesis.micro_batch import weight_bytes
+from zsdata.synthesis.synthesizer import INPAINT_CONTEXT_PX
+
+STAGES = {"encode": "_encode", "U-Net": "_denoise", "decode": "_decode"}
+
+
+class LiveBytes(TorchDispatchMode):
+    """Counts the memory of the tensors that operations make while it is entered, from when they are made until nothing refers to them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.peak = 0
+        self._now = 0
+        self._made: set[int] = set()
+
+    def __torch_dispatch__(
+        self, function: Callable[..., Any], types: Sequence[type], args: Sequence[Any] = (), kwargs: Mapping[str, Any] | None = None
+    ) -> Any:
+        there_before = {tensor.untyped_storage()._cdata for tensor in tree_leaves((args, kwargs)) if isinstance(tensor, Tensor)}
+        result = function(*args, **(kwargs or {}))
+        for tensor in tree_leaves(result):
+            if isinstance(tensor, Tensor):
+                storage = tensor.untyped_storage()
+                if storage._cdata not in there_before and storage._cdata not in self._made:
+                    self._made.add(storage._cdata)
+                    self._now += storage.nbytes()
+                    weakref.finalize(storage, self._forget, storage._cdata, storage.nbytes())
+        self.peak = max(self.peak, self._now)
+        return result
+
+    def _forget(self, storage: int, size: int) -> None:
+        self._made.discard(storage)
+        self._now -= size
+
+
+def stage_bytes(inpainter: DiffusionInpainter, pairs: int, size: tuple[int, int]) -> dict[str, int]:
+    """The most memory that each stage's tensors take at once, beside the weights."""
+    peaks = {}
+
+    def counted(stage: str, step: Callable[..., Tensor]) -> Callable[..., Tensor]:
+        def count(*arguments: Any) -> Tensor:
+            with LiveBytes() as live:
+                made = step(*arguments)
+            peaks[stage] = live.peak
+            return made
+
+        return count
+
+    for stage, method in STAGES.items():
+        setattr(inpainter, method, counted(stage, getattr(inpainter, method)))
+    inpainter._try(pairs, size)
+    return peaks
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--smoke", action="store_true", help="small networks in float32")
+    parser.add_argument(
+        "--size", type=int, nargs=2, default=(384, 512), metavar=("HEIGHT", "WIDTH"), help="of the pairs (default: 384 512)"
+    )
+    parser.add_argument("--micro-batch", type=int, default=8, help="pairs at once (default: 8)")
+    options = parser.parse_args(arguments)
+    height, width = options.size
+    for library in (diffusers, transformers):
+        library.logging.set_verbosity_error()  # what they say of made-up configurations
+        library.logging.disable_progress_bar()
+    print(f"torch {torch.__version__}, {height}x{width}, micro-batch {options.micro_batch}, {'float32' if options.smoke else 'bf16'}; GiB")
+    print_row(("autoencoder", "weights", *STAGES, "all", "target"))
+    with tempfile.TemporaryDirectory() as folder:
+        save_pipeline(Path(folder), torch.device("cpu"), options.smoke)
+        for autoencoder in ("full", "tiny"):
+            tiny = str(Path(folder) / "tiny") if autoencoder == "tiny" else None
+            inpainter = load_inpainter(folder, steps=1, autoencoder=tiny, dtype="float32" if options.smoke else "bf16")
+            assert isinstance(inpainter, DiffusionInpainter)
+            peaks = stage_bytes(inpainter, options.micro_batch, (height, width + INPAINT_CONTEXT_PX))
+            weights = weight_bytes(inpainter._unet, inpainter._autoencoder)
+            together = weights + max(peaks.values())
+            print_row((autoencoder, gib(weights), *map(gib, peaks.values()), gib(together), f"{MEMORY_TARGET_GIB:g}"))
+
+
+if __name__ == "__main__":
+    main()
