@@ -180,8 +180,8 @@ def _nearest_values(edge: Tensor, frame: _Frame) -> Tensor:
     far = flat_indices(square > (NEAR_ROWS + 1) ** 2)
     if far.shape[0]:
         none = frame.columns  # farther than any value of the row
-        tables = [frame.table(edge, off, none) for off in columns_off(none)]
-        found[far] = _nearest_values_row_by_row(edge[far], tables, none, frame)
+        sides = [frame.table(edge, off, none) for off in columns_off(none)]
+        found[far] = _nearest_values_row_by_row(edge[far], sides, none, frame)
     return found
 
 
