@@ -86,7 +86,7 @@ def forward_warp(left: Tensor, disparity: Tensor, columns: int | None = None) ->
         raise ValueError(f"columns is in 1..{width}, the width of `left`; got {columns}")
     disparity, largest = _within_reach(disparity.float(), width)
     flat = left.flatten(1)
-    limits = torch.stack((flat.amin(1), flat.amax(1)), 1).tolist()  # the cubic overshoots
+    limits = torch.stack((flat.amin(1), flat.amax(1)), 1).to(_arithmetic(left))  # the cubic overshoots
 
     part_px, images_at_once = (CPU_PART_PX, 1) if left.device.type == "cpu" else (PART_PX, max(1, min(batch, PART_PX // (height * width))))
     parts_of_image = -(-height * width // part_px)
@@ -157,7 +157,7 @@ class _Memory:
 def _within_reach(disparity: Tensor, width: int) -> tuple[Tensor, float]:
     """The disparity with all that lands outside of the frame on its left just there, and the largest value."""
     outside = width + 2.0
-    least, largest = float(disparity.amin()), float(disparity.amax())
+    least, largest = torch.stack((disparity.amin(), disparity.amax())).tolist()  # at once: a GPU is waited for
     if not (least >= 0 and largest <= outside):
         disparity = disparity.nan_to_num(outside, outside, outside).clamp(max=outside)
         least, largest = float(disparity.amin()), float(disparity.amax())
@@ -210,13 +210,13 @@ class _Grid(NamedTuple):
         return cells[: -self.margin].view(-1, self.stride)[:, self.margin : self.margin + self.columns]
 
 
-def _warp_part(planes: Tensor, disparity: Tensor, limits: list[list[float]], grid: _Grid, memory: _Memory, out: Warped) -> None:
+def _warp_part(planes: Tensor, disparity: Tensor, limits: Tensor, grid: _Grid, memory: _Memory, out: Warped) -> None:
     """Warps whole rows.
 
     Args:
-        planes: [C, N], uint8 or float, of one image or, where there is more than one limit, of as many.
+        planes: [C, N], uint8 or float, of one or several images.
         disparity: [N].
-        limits: least and largest value of each image.
+        limits: [images, 2], least and largest value of each.
         out: what is filled in: right [C, M], masks [rows, columns], right_disparity [M], for M = rows * columns.
     """
     count = disparity.shape[0]
@@ -230,7 +230,7 @@ def _warp_part(planes: Tensor, disparity: Tensor, limits: list[list[float]], gri
     used = memory.used
 
     shown = memory.take(1 + count + special.share.shape[0])  # as in `_colours`
-    shown[0] = 0
+    shown[:1].zero_()
     torch.lerp(disparity[:-1], disparity[1:], surfaces.share[:-1], out=shown[1:count])
     shown[count] = disparity[-1]
     shown[1 + count :] = special.disparity
@@ -269,21 +269,22 @@ def _surfaces(disparity: Tensor, grid: _Grid, memory: _Memory) -> _Surfaces:
     used = memory.used
     drop = share  # to the right neighbour
     torch.sub(disparity[:-1], disparity[1:], out=drop[:-1])
-    drop.view(-1, grid.width)[:, -1] = 0
-    joined[0] = joined[-1] = 0
+    drop.view(-1, grid.width)[:, -1].zero_()
+    joined[:1].zero_()
+    joined[-1:].zero_()
     same = torch.abs(drop, out=joined[1:-1]).le_(LARGEST_STEP_PX)  # 1 or 0: comparisons of floats in place are the fastest
-    same.view(-1, grid.width)[:, -1] = 0
+    same.view(-1, grid.width)[:, -1].zero_()
 
     # A pixel covers the first column at or right of x' unless its neighbour on the same surface lands at or left of that column, too. The
     # right end of a surface, which reaches half a pixel far, is left to `_special`.
     whole = torch.floor(disparity, out=memory.take(count))
     rise = memory.take(count)
     torch.sub(whole[1:], whole[:-1], out=rise[:-1])
-    rise[-1] = 0
+    rise[-1:].zero_()
     rise.mul_(same)
     covers = torch.clamp(rise, -1, 0, out=memory.take(count)).add_(same)
     simple = memory.take(count + 1, torch.bool)
-    simple[0] = False
+    simple[:1].zero_()
     simple[1:] = covers
     torch.sub(same, rise.clamp_(min=0), out=covers)
     place = memory.take(count, torch.int32).copy_(covers).mul_(grid.place)
@@ -344,7 +345,7 @@ def _special(disparity: Tensor, surfaces: _Surfaces, grid: _Grid) -> _Special:
     return _Special(source, share, torch.lerp(here, following, share))
 
 
-def _colours(planes: Tensor, surfaces: _Surfaces, special: _Special, limits: list[list[float]], memory: _Memory) -> Iterator[Tensor]:
+def _colours(planes: Tensor, surfaces: _Surfaces, special: _Special, limits: Tensor, memory: _Memory) -> Iterator[Tensor]:
     """For each channel a zero for the holes, the colours that the N pixels show, and those of the special ones; [1 + N + S]."""
     count, dtype = planes.shape[1], _arithmetic(planes)
     others = _special_colours(planes, surfaces.joined, special, limits)
@@ -352,18 +353,19 @@ def _colours(planes: Tensor, surfaces: _Surfaces, special: _Special, limits: lis
     weights = weights.fill(surfaces.share, surfaces.joined[:-2], surfaces.joined[2:]).to(dtype)
     values = memory.take(count, dtype)
     change = memory.take(count + 2, dtype)  # from the left neighbour; the outermost have no weight
-    change[0] = 0
-    change[-2:] = 0
+    change[:1].zero_()
+    change[-2:].zero_()
     changes = change[:-2], change[1:-1], change[2:]
     colours, rounded = (memory.take(1 + count + special.share.shape[0], kind) for kind in (dtype, planes.dtype))
-    colours[0] = 0
+    colours[:1].zero_()
     ordinary = colours[1 : 1 + count]
+    images = ordinary.view(len(limits), -1)
+    least_and_largest = limits[0].tolist() if len(limits) == 1 else (limits[:, :1], limits[:, 1:])  # numbers are the fastest
     for plane, other in zip(planes, others, strict=True):
         values.copy_(plane)
         torch.sub(values[1:], values[:-1], out=change[1:-2])
         weights.cubic(values, changes, out=ordinary)
-        for image, (least, largest) in zip(ordinary.view(len(limits), -1), limits, strict=True):
-            image.clamp_(least, largest)
+        images.clamp_(*least_and_largest)
         colours[1 + count :] = other
         yield colours if planes.is_floating_point() else _round(colours, out=rounded)
 
@@ -381,7 +383,7 @@ def _round(values: Tensor, out: Tensor) -> Tensor:
     return out.copy_(values.round())
 
 
-def _special_colours(planes: Tensor, joined: Tensor, special: _Special, limits: list[list[float]]) -> Tensor:
+def _special_colours(planes: Tensor, joined: Tensor, special: _Special, limits: Tensor) -> Tensor:
     """[C, S]."""
     source, share, _ = special
     weights = _Weights(*(torch.empty_like(share) for _ in range(3)))
@@ -390,9 +392,9 @@ def _special_colours(planes: Tensor, joined: Tensor, special: _Special, limits: 
     taps = torch.stack([plane.index_select(0, places) for plane in planes]).to(_arithmetic(planes)).view(len(planes), 4, -1)
     colours = weights.cubic(taps[:, 1], taps.diff(dim=1).unbind(1))
     if len(limits) == 1:
-        return colours.clamp_(*limits[0])
+        return colours.clamp_(*limits[0].tolist())
     image = torch.div(source, planes.shape[1] // len(limits), rounding_mode="floor")
-    return colours.clamp_(*colours.new_tensor(limits).index_select(0, image).unbind(1))
+    return colours.clamp_(*limits.index_select(0, image).unbind(1))
 
 
 class _Weights(NamedTuple):
