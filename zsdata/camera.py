@@ -178,29 +178,32 @@ def rotate_hue(images: Tensor, turns: Tensor) -> Tensor:
     red, green, blue = images.unbind(1)
     value = images.amax(1)
     chroma = value - images.amin(1)
-    is_red, is_green = value == red, value == green
-    hue = torch.where(is_red, green - blue, torch.where(is_green, blue - red, red - green))
-    hue /= torch.where(chroma == 0, 1.0, chroma)
+    # Masks of 1 and 0, between which `lerp` chooses exactly: on the CPU `where` takes twenty times as long.
+    compared = (value, red), (value, green), (chroma, 0)
+    is_red, is_green, is_grey = (torch.eq(one, other, out=torch.empty_like(value)) for one, other in compared)
+    hue = torch.lerp(torch.lerp(red - green, blue - red, is_green), green - blue, is_red)
+    hue /= chroma + is_grey
     # Sextants from red: red is the largest within 1 of 0, green within 1 of 2, blue within 1 of 4.
-    hue += torch.where(is_red, 0.0, torch.where(is_green, 2.0, 4.0))
+    hue += (4 - 2 * is_green).mul_(1 - is_red)
     hue += 6 * turns.view(-1, 1, 1)
+    hue -= (hue / 6).floor_().mul_(6)
+    # How far a channel is below the value, in chromas: red about sextant 3, green anywhere but about 2, blue but about 4.
+    lows = (hue - 3).abs_().neg_().add_(2), (hue - 2).abs_().sub_(1), (hue - 4).abs_().sub_(1)
     result = torch.empty_like(images)
-    for channel, start in enumerate((5, 3, 1)):
-        # A channel is low by `chroma` for two sextants, and rises and falls within one on either side.
-        sextant = hue + start
-        sextant -= (sextant / 6).floor_().mul_(6)
-        low = torch.minimum(sextant, 4 - sextant).clamp_(0, 1)
-        torch.sub(value, low.mul_(chroma), out=result[:, channel])
+    for channel, low in enumerate(lows):
+        torch.sub(value, low.clamp_(0, 1).mul_(chroma), out=result[:, channel])
     return result.clamp_(0, 255)
 
 
 def apply_curve(images: Tensor, curves: Tensor) -> Tensor:
     """Tone curves: `curves` [N, 256] holds the result for 0, 1, ..., 255, linear in between."""
     lower = images.floor().clamp_(0, 254)
-    part = images - lower
-    index = lower.long() + 256 * torch.arange(len(images), device=images.device).view(-1, 1, 1, 1)
-    dark = curves.take(index)
-    return curves.take(index + 1).sub_(dark).mul_(part).add_(dark).clamp_(0, 255)
+    index = lower.long()
+    index += 256 * torch.arange(len(images), device=images.device).view(-1, 1, 1, 1)
+    index, curves = index.flatten(), curves.flatten()
+    dark, light = (values.index_select(0, index).view_as(images) for values in (curves, curves[1:]))
+    part = torch.sub(images, lower, out=lower)
+    return light.sub_(dark).mul_(part).add_(dark).clamp_(0, 255)
 
 
 def to_grey(images: Tensor) -> Tensor:
