@@ -149,12 +149,11 @@ class _Frame:
 
 def _nearest_values(edge: Tensor, frame: _Frame) -> Tensor:
     """Where each edge takes its value from. Places are indices into the flattened, padded maps, int64; those of the edges ascend."""
-    begins = torch.ones_like(edge, dtype=torch.bool)  # of a run of edges in one row
-    torch.ne(edge[1:] - edge[:-1], 1, out=begins[1:])
-    run = begins.cumsum(0).sub_(1)
-    first = flat_indices(begins)
-    before = edge.index_select(0, first) - 1
-    after = edge.index_select(0, torch.cat((first[1:], first.new_tensor([edge.shape[0]]))) - 1) + 1
+    begins = torch.ones(edge.shape[0] + 1, dtype=torch.bool, device=edge.device)  # a run of edges in one row, or ends them all
+    torch.ne(edge[1:] - edge[:-1], 1, out=begins[1:-1])
+    run = begins[:-1].cumsum(0).sub_(1)
+    bounds = flat_indices(begins)
+    before, after = edge.index_select(0, bounds[:-1]) - 1, edge.index_select(0, bounds[1:] - 1) + 1
 
     def columns_off(none: int) -> tuple[Tensor, Tensor]:
         """How far off the nearest value of its row is, on the left and on the right of each edge; `none` at most."""
@@ -174,7 +173,7 @@ def _nearest_values(edge: Tensor, frame: _Frame) -> Tensor:
     choice = key.sub_(square, alpha=count)
     tables = [step for step in row_steps for _ in (0, 1)], [-1, 1] * len(row_steps)
     row_step, side = (edge.new_tensor(table).index_select(0, choice) for table in tables)
-    column_step = (square - row_step * row_step).double().sqrt_().long()
+    column_step = (square - row_step * row_step).float().sqrt_().long()
     found = row_step.mul_(frame.columns).add_(edge).add_(column_step.mul_(side))
 
     far = flat_indices(square > (NEAR_ROWS + 1) ** 2)

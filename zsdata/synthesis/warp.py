@@ -91,8 +91,8 @@ def forward_warp(left: Tensor, disparity: Tensor, columns: int | None = None) ->
     part_px, images_at_once = (CPU_PART_PX, 1) if left.device.type == "cpu" else (PART_PX, max(1, min(batch, PART_PX // (height * width))))
     parts_of_image = -(-height * width // part_px)
     rows_at_once = -(-height // parts_of_image)
-    grid = _Grid.make(images_at_once * rows_at_once, width, columns, reach=int(largest) + 2, device=left.device)
-    memory = _Memory.get(BYTES_PER_PX * grid.count, left.device)
+    memory = _Memory.get(BYTES_PER_PX * images_at_once * rows_at_once * width, left.device)
+    grid = _Grid.make(images_at_once * rows_at_once, width, columns, int(largest) + 2, memory)
     right = _fresh((channels, batch, height, columns), left.dtype, left.device)
     right_disparity = _fresh((batch, height, columns), torch.float32, left.device)
     hole, seen = (_fresh((batch, height, columns), torch.bool, left.device) for _ in range(2))
@@ -130,6 +130,7 @@ class _Memory:
         self._size = size
         block = _fresh((-(-size // ALIGNED_BYTES) * ALIGNED_BYTES,), torch.uint8, device)
         self._as = {dtype: block.view(dtype) for dtype in (torch.uint8, torch.bool, torch.int32, torch.int64, torch.float32)}
+        self._places = torch.empty(0, dtype=torch.int32, device=device)
         self.device = device
         self.used = 0  # bytes; set it back to give back what was taken since
 
@@ -143,6 +144,12 @@ class _Memory:
             np.empty(RECYCLED_BYTES, np.uint8)  # never touched, and given back at once
             kept = cls._kept.memory = cls(size, device)
         return kept
+
+    def places(self, count: int) -> Tensor:
+        """int32 [count], 1 to `count`; not to be written into, as they are kept."""
+        if self._places.shape[0] < count:
+            self._places = torch.arange(1, count + 1, dtype=torch.int32, device=self.device)
+        return self._places[:count]
 
     def take(self, count: int, dtype: torch.dtype = torch.float32) -> Tensor:
         """[count], with anything in it."""
@@ -187,14 +194,13 @@ class _Grid(NamedTuple):
     cell: Tensor
 
     @staticmethod
-    def make(rows: int, width: int, columns: int, reach: int, device: torch.device) -> _Grid:
+    def make(rows: int, width: int, columns: int, reach: int, memory: _Memory) -> _Grid:
         margin = max(reach, width - columns)
         margin += margin % 2
         stride = margin + columns + columns % 2
-        row, column = (torch.arange(count, dtype=torch.int32, device=device) for count in (rows, width))
-        place = (row * width).unsqueeze(1) + (column + 1)
+        row, column = (torch.arange(count, dtype=torch.int32, device=memory.device) for count in (rows, width))
         cell = (row * stride).unsqueeze(1) + (column + margin)
-        return _Grid(rows * width, width, columns, margin, stride, place.flatten(), cell.flatten())
+        return _Grid(rows * width, width, columns, margin, stride, memory.places(rows * width), cell.flatten())
 
     def first(self, count: int) -> _Grid:
         """The grid of the first `count` pixels."""
