@@ -51,7 +51,7 @@ class Shuffle:
         return high << self._half_bits | low
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=256, typed=True)  # a key of another type is another shuffle, whatever was asked for before
 def _shuffle(size: int, *key: int | str) -> Shuffle:
     """Those of an epoch, which all its samples ask for."""
     return Shuffle(size, *key)
