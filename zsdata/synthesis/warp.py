@@ -91,8 +91,8 @@ def forward_warp(left: Tensor, disparity: Tensor, columns: int | None = None) ->
     part_px, images_at_once = (CPU_PART_PX, 1) if left.device.type == "cpu" else (PART_PX, max(1, min(batch, PART_PX // (height * width))))
     parts_of_image = -(-height * width // part_px)
     rows_at_once = -(-height // parts_of_image)
-    memory = _Memory.get(BYTES_PER_PX * images_at_once * rows_at_once * width, left.device)
-    grid = _Grid.make(images_at_once * rows_at_once, width, columns, int(largest) + 2, memory)
+    grid = _Grid.make(images_at_once * rows_at_once, width, columns, reach=int(largest) + 2, device=left.device)
+    memory = _Memory.get(BYTES_PER_PX * grid.count, left.device)
     right = _fresh((channels, batch, height, columns), left.dtype, left.device)
     right_disparity = _fresh((batch, height, columns), torch.float32, left.device)
     hole, seen = (_fresh((batch, height, columns), torch.bool, left.device) for _ in range(2))
@@ -130,8 +130,7 @@ class _Memory:
         self._size = size
         block = _fresh((-(-size // ALIGNED_BYTES) * ALIGNED_BYTES,), torch.uint8, device)
         self._as = {dtype: block.view(dtype) for dtype in (torch.uint8, torch.bool, torch.int32, torch.int64, torch.float32)}
-        self._places = torch.empty(0, dtype=torch.int32, device=device)
-        self.device = device
+        self._device = device
         self.used = 0  # bytes; set it back to give back what was taken since
 
     @classmethod
@@ -145,18 +144,12 @@ class _Memory:
             kept = cls._kept.memory = cls(size, device)
         return kept
 
-    def places(self, count: int) -> Tensor:
-        """int32 [count], 1 to `count`; not to be written into, as they are kept."""
-        if self._places.shape[0] < count:
-            self._places = torch.arange(1, count + 1, dtype=torch.int32, device=self.device)
-        return self._places[:count]
-
     def take(self, count: int, dtype: torch.dtype = torch.float32) -> Tensor:
         """[count], with anything in it."""
         start = -(-self.used // ALIGNED_BYTES) * ALIGNED_BYTES
         end = start + count * dtype.itemsize
         if end > self._size or dtype not in self._as:  # images in float64 or in half, or hardly two neighbours on one surface
-            return torch.empty(count, dtype=dtype, device=self.device)
+            return torch.empty(count, dtype=dtype, device=self._device)
         self.used = end
         return self._as[dtype][start // dtype.itemsize : end // dtype.itemsize]
 
@@ -164,13 +157,18 @@ class _Memory:
 def _within_reach(disparity: Tensor, width: int) -> tuple[Tensor, float]:
     """The disparity with all that lands outside of the frame on its left just there, and the largest value."""
     outside = width + 2.0
-    least, largest = torch.stack((disparity.amin(), disparity.amax())).tolist()  # at once: a GPU is waited for
+    least, largest = _extent(disparity)
     if not (least >= 0 and largest <= outside):
         disparity = disparity.nan_to_num(outside, outside, outside).clamp(max=outside)
-        least, largest = float(disparity.amin()), float(disparity.amax())
+        least, largest = _extent(disparity)
         if least < 0:
             raise ValueError(f"disparity is positive: left (x, y) is right (x - d, y); got {least:g} px")
     return disparity, largest
+
+
+def _extent(values: Tensor) -> list[float]:
+    """The least and the largest, with one wait for the device."""
+    return torch.stack((values.amin(), values.amax())).tolist()
 
 
 class _Grid(NamedTuple):
@@ -194,13 +192,14 @@ class _Grid(NamedTuple):
     cell: Tensor
 
     @staticmethod
-    def make(rows: int, width: int, columns: int, reach: int, memory: _Memory) -> _Grid:
+    def make(rows: int, width: int, columns: int, reach: int, device: torch.device) -> _Grid:
         margin = max(reach, width - columns)
         margin += margin % 2
         stride = margin + columns + columns % 2
-        row, column = (torch.arange(count, dtype=torch.int32, device=memory.device) for count in (rows, width))
+        row, column = (torch.arange(count, dtype=torch.int32, device=device) for count in (rows, width))
+        place = (row * width).unsqueeze(1) + (column + 1)
         cell = (row * stride).unsqueeze(1) + (column + margin)
-        return _Grid(rows * width, width, columns, margin, stride, memory.places(rows * width), cell.flatten())
+        return _Grid(rows * width, width, columns, margin, stride, place.flatten(), cell.flatten())
 
     def first(self, count: int) -> _Grid:
         """The grid of the first `count` pixels."""
