@@ -1,6 +1,6 @@
 """Which GPU does diffusion inpainting fit on? The memory of a micro-batch, counted tensor by tensor; no GPU needed.
 
-    python benchmarks/inpainting_memory.py                  # full-size networks on the CPU, two minutes and 8 GB of memory
+    python benchmarks/inpainting_memory.py                  # full-size networks on the CPU, two minutes
     python benchmarks/inpainting_memory.py --smoke          # small networks: does it run at all
 
 Stable Diffusion 2 Inpainting's U-Net and autoencoder with random weights, as in tiers.py, make two steps with real tensors in bf16. Counted
@@ -13,14 +13,15 @@ from __future__ import annotations
 import argparse
 import tempfile
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import diffusers
 import torch
 import transformers
-from tiers import MEMORY_TARGET_GIB, gib, print_row, save_pipeline
+from tiers import MEMORY_TARGET_GIB, STAGES, around_stages, gib, print_row, save_pipeline
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -30,16 +31,16 @@ from zsdata.synthesis.inpaint.diffusion import DiffusionInpainter
 from zsdata.synthesis.micro_batch import weight_bytes
 from zsdata.synthesis.synthesizer import INPAINT_CONTEXT_PX
 
-STAGES = {"encode": "_encode", "U-Net": "_denoise", "decode": "_decode"}
-
 
 class LiveBytes(TorchDispatchMode):
-    """Counts the memory of the tensors that operations make while it is entered, from when they are made until nothing refers to them."""
+    """Counts the memory of the tensors that operations make while it is entered, from when they are made until nothing refers to them.
+
+    `now` is what they take, in bytes, `peak` the most that they took since it was last set.
+    """
 
     def __init__(self) -> None:
         super().__init__()
-        self.peak = 0
-        self._now = 0
+        self.peak = self.now = 0
         self._made: set[int] = set()
 
     def __torch_dispatch__(
@@ -52,32 +53,29 @@ class LiveBytes(TorchDispatchMode):
                 storage = tensor.untyped_storage()
                 if storage._cdata not in there_before and storage._cdata not in self._made:
                     self._made.add(storage._cdata)
-                    self._now += storage.nbytes()
+                    self.now += storage.nbytes()
                     weakref.finalize(storage, self._forget, storage._cdata, storage.nbytes())
-        self.peak = max(self.peak, self._now)
+        self.peak = max(self.peak, self.now)
         return result
 
     def _forget(self, storage: int, size: int) -> None:
         self._made.discard(storage)
-        self._now -= size
+        self.now -= size
 
 
 def stage_bytes(inpainter: DiffusionInpainter, pairs: int, size: tuple[int, int]) -> dict[str, int]:
-    """The most memory that each stage's tensors take at once, beside the weights."""
+    """The most memory that all tensors beside the weights take at once, while each stage runs."""
     peaks = {}
+    with LiveBytes() as live:
 
-    def counted(stage: str, step: Callable[..., Tensor]) -> Callable[..., Tensor]:
-        def count(*arguments: Any) -> Tensor:
-            with LiveBytes() as live:
-                made = step(*arguments)
+        @contextmanager
+        def count(stage: str) -> Iterator[None]:
+            live.peak = live.now
+            yield
             peaks[stage] = live.peak
-            return made
 
-        return count
-
-    for stage, method in STAGES.items():
-        setattr(inpainter, method, counted(stage, getattr(inpainter, method)))
-    inpainter._try(pairs, size)
+        with around_stages(inpainter, count):
+            inpainter._try(pairs, size)
     return peaks
 
 

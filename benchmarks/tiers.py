@@ -17,7 +17,8 @@ import platform
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ DEPTH_TARGETS = {"Small": 150.0}  # photos/s with their mirror images
 MEMORY_TARGET_GIB = 8.0  # micro-batch 8 with the full autoencoder
 PHOTO = (768, 1024)  # Depth Anything sees it at 518x686
 HOLE_SHARE = 0.1
+STAGES = {"encode": "_encode", "denoise": "_denoise", "decode": "_decode"}  # of an inpainter, and the methods that do them
 
 STABLE_DIFFUSION_2: dict[str, Any] = {
     "sample_size": 64,
@@ -296,29 +298,40 @@ def timed(work: Callable[[], object], device: torch.device, repeats: int) -> tup
     return statistics.median(seconds), torch.cuda.max_memory_allocated(device) - before if cuda else None
 
 
+@contextmanager
+def around_stages(inpainter: DiffusionInpainter, enter: Callable[[str], AbstractContextManager[None]]) -> Iterator[None]:
+    """Lets every stage of the inpainter run inside of `enter(its name)`."""
+
+    def inside(stage: str, step: Callable[..., Tensor]) -> Callable[..., Tensor]:
+        def run(*arguments: Any) -> Tensor:
+            with enter(stage):
+                return step(*arguments)
+
+        return run
+
+    for stage, method in STAGES.items():
+        setattr(inpainter, method, inside(stage, getattr(inpainter, method)))
+    yield
+    for method in STAGES.values():
+        delattr(inpainter, method)
+
+
 def stage_ms(inpainter: DiffusionInpainter, work: Callable[[], object], pairs: int, device: torch.device) -> dict[str, float]:
     """Milliseconds a pair of each stage of one run; the device is waited for between them."""
-    spent = {}
+    spent = dict.fromkeys(STAGES, 0.0)
+    wait = torch.cuda.synchronize if device.type == "cuda" else lambda: None
 
-    def watch(stage: str, step: Callable[..., Tensor]) -> Callable[..., Tensor]:
-        def watched(*arguments: Any) -> Tensor:
-            wait = torch.cuda.synchronize if device.type == "cuda" else lambda: None
-            wait()
-            start = time.perf_counter()
-            made = step(*arguments)
-            wait()
-            spent[stage] = spent.get(stage, 0.0) + 1e3 * (time.perf_counter() - start) / pairs
-            return made
+    @contextmanager
+    def take_time(stage: str) -> Iterator[None]:
+        wait()
+        start = time.perf_counter()
+        yield
+        wait()
+        spent[stage] += 1e3 * (time.perf_counter() - start) / pairs
 
-        return watched
-
-    stages = {"encode": "_encode", "denoise": "_denoise", "decode": "_decode"}
-    for stage, method in stages.items():
-        setattr(inpainter, method, watch(stage, getattr(inpainter, method)))
-    work()
-    for method in stages.values():
-        delattr(inpainter, method)
-    return {f"{stage}_ms": spent[stage] for stage in stages}
+    with around_stages(inpainter, take_time):
+        work()
+    return {f"{stage}_ms": ms for stage, ms in spent.items()}
 
 
 def release(device: torch.device) -> None:
