@@ -178,7 +178,7 @@ def rotate_hue(images: Tensor, turns: Tensor) -> Tensor:
     red, green, blue = images.unbind(1)
     value = images.amax(1)
     chroma = value - images.amin(1)
-    # Masks of 1 and 0, between which `lerp` chooses exactly: on the CPU `where` takes twenty times as long.
+    # Masks of 1 and 0, between which `lerp` chooses exactly: on the CPU `where` takes up to twenty times as long.
     compared = (value, red), (value, green), (chroma, 0)
     is_red, is_green, is_grey = (torch.eq(one, other, out=torch.empty_like(value)) for one, other in compared)
     hue = torch.lerp(torch.lerp(red - green, blue - red, is_green), green - blue, is_red)
