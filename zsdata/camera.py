@@ -6,7 +6,7 @@ sums whole numbers exactly, so an image comes out bit-identical whatever it is b
 
 kornia gives the luma. Its other operations were weighed and left, each for a reason:
 
-* `adjust_hue` goes through a full HSV image: six times the time of `rotate_hue`, more than all the rest of the augmentation together;
+* `adjust_hue` goes through a full HSV image: eight times the time of `rotate_hue`, more than all the rest of the augmentation together;
 * `adjust_contrast_with_mean_subtraction` takes the mean by a float sum, whose value depends on the order of the sum;
 * `adjust_gamma` calls `pow`, whose last bit differs between the vectorised part of a tensor and its tail;
 * `gaussian_blur2d` is a convolution on a GPU, in TF32 by default: it would move pixels by a tenth of a grey level;
