@@ -1,11 +1,16 @@
 """What each tier of quality costs on the training device: inpainting by steps and autoencoder, depth by network size.
 
-    python benchmarks/tiers.py                  # full-size networks on the GPU, a few minutes
-    python benchmarks/tiers.py --smoke          # small networks on the CPU: does it run at all
+    python benchmarks/tiers.py                             # full-size networks on the GPU, a few minutes
+    python benchmarks/tiers.py --device cpu --dtype bf16   # the same networks on the CPU, half an hour on two cores
+    python benchmarks/tiers.py --smoke                     # small networks on the CPU: does it run at all
 
 Networks are built from the published configurations with random weights, which take the same time as trained ones: Stable Diffusion 2
 Inpainting's U-Net and autoencoder, the tiny autoencoder (TAESD), Depth Anything V2 Small, Base and Large. They are saved and loaded as the
 real ones are. Images, masks and noise lie on the device; "pairs/s" is the inpainter alone, without a matcher beside it.
+
+"TFLOP" is the arithmetic of a pair's matrix products and convolutions, the same on every device; "TFLOP/s" is how fast they went, and "of
+matmul" the share of what one large matrix product reaches on the device in the same run: where it is high, arithmetic is what bounds the
+tier, and only fewer steps, a smaller autoencoder or a faster device help.
 """
 
 from __future__ import annotations
@@ -34,6 +39,7 @@ from zsdata.seeding import rng
 from zsdata.synthesis.inpaint import fill
 from zsdata.synthesis.inpaint.diffusion import DiffusionInpainter
 from zsdata.synthesis.micro_batch import GIB
+from zsdata.synthesis.precision import choose_dtype
 from zsdata.synthesis.synthesizer import INPAINT_CONTEXT_PX
 
 TIERS = (1, 4, 8, 50)  # denoising steps
@@ -84,60 +90,97 @@ SMALL_DEPTH_ANYTHING = {"Tiny": (32, 4, 2, [8, 16, 24, 32], 16, [1, 2, 3, 4])}
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda", help="default: cuda")
     parser.add_argument("--smoke", action="store_true", help="small networks in float32 on the CPU")
     parser.add_argument(
         "--size", type=int, nargs=2, default=(384, 512), metavar=("HEIGHT", "WIDTH"), help="of the pairs (default: 384 512)"
     )
-    parser.add_argument("--micro-batch", type=int, default=8, help="pairs at once (default: 8)")
-    parser.add_argument("--repeats", type=int, default=5, help="the median of so many runs counts (default: 5)")
+    parser.add_argument("--micro-batch", type=int, help="pairs at once (default: 8, on the CPU 1, as in the stream)")
+    parser.add_argument("--repeats", type=int, help="the median of so many runs counts (default: 5, on the CPU 3)")
     parser.add_argument("--dtype", help="float32, bf16 or fp16 (default: as the device has it)")
     parser.add_argument("--compile", nargs="?", const="default", help="torch.compile, optionally its mode, such as reduce-overhead")
     parser.add_argument("--tiers", type=int, nargs="+", default=TIERS, metavar="STEPS", help="default: 1 4 8 50")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also writes the figures there")
     options = parser.parse_args(arguments)
     if options.smoke:
-        options.size, options.micro_batch, options.repeats, options.tiers = (64, 96), 2, 1, [1, 4]
-    elif not torch.cuda.is_available():
-        parser.error("full-size networks want a GPU, and torch finds none; --smoke runs small ones on the CPU")
+        options.device, options.size, options.micro_batch, options.repeats, options.tiers = "cpu", (64, 96), 2, 1, [1, 4]
+    elif options.device == "cuda" and not torch.cuda.is_available():
+        parser.error("torch finds no GPU; --device cpu runs the full-size networks on the CPU (half an hour), --smoke small ones")
+    device = torch.device(options.device)
+    options.micro_batch = options.micro_batch or (1 if device.type == "cpu" else 8)
+    options.repeats = options.repeats or (3 if device.type == "cpu" else 5)
     for library in (diffusers, transformers):
         library.logging.set_verbosity_error()  # what they say of made-up configurations
         library.logging.disable_progress_bar()
-    device = torch.device("cpu" if options.smoke else "cuda")
-    name = platform.processor() or platform.machine() if options.smoke else torch.cuda.get_device_name()
-    print(f"{name}, torch {torch.__version__}, Python {platform.python_version()}, {options.size[0]}x{options.size[1]}")
+    name = cpu_name() if device.type == "cpu" else torch.cuda.get_device_name(device)
+    dtype = choose_dtype(options.dtype, device)
+    matmul = matmul_tflops(device, dtype, options)
+    print(
+        f"{name}, torch {torch.__version__}, Python {platform.python_version()}, {options.size[0]}x{options.size[1]}, {dtype}; "
+        f"a matrix product runs at {matmul:.3g} TFLOP/s"
+    )
     with tempfile.TemporaryDirectory() as folder:
-        inpainting = measure_inpainting(Path(folder), device, options)
-        depth = measure_depth(Path(folder), device, options)
+        inpainting = measure_inpainting(Path(folder), device, matmul, options)
+        depth = measure_depth(Path(folder), device, matmul, options)
     if options.json:
         options.json.write_text(
-            json.dumps({"device": name, "torch": torch.__version__, "inpainting": inpainting, "depth": depth}, indent=2)
+            json.dumps(
+                {
+                    "device": name,
+                    "torch": torch.__version__,
+                    "dtype": str(dtype),
+                    "matmul_tflops": matmul,
+                    "inpainting": inpainting,
+                    "depth": depth,
+                },
+                indent=2,
+            )
         )
 
 
-def measure_inpainting(folder: Path, device: torch.device, options: argparse.Namespace) -> list[dict[str, Any]]:
+def cpu_name() -> str:
+    """As the system calls it, with the threads that torch takes."""
+    cpu = platform.processor() or platform.machine()
+    try:
+        cpu = next(line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name"))
+    except (OSError, StopIteration):
+        pass
+    return f"{cpu}, {torch.get_num_threads()} threads"
+
+
+def matmul_tflops(device: torch.device, dtype: torch.dtype, options: argparse.Namespace) -> float:
+    """TFLOP/s of a matrix product that is large enough to keep the device busy."""
+    side = 256 if options.smoke else 8192 if device.type == "cuda" else 2048
+    one = torch.randn(side, side, dtype=dtype, device=device)
+    seconds, _ = timed(lambda: one @ one, device, 5)
+    return 2 * side**3 / seconds / 1e12
+
+
+def measure_inpainting(folder: Path, device: torch.device, matmul: float, options: argparse.Namespace) -> list[dict[str, Any]]:
     save_pipeline(folder / "pipeline", device, options.smoke)
     height, width = options.size
     right, inpaint_mask = images_with_holes(options.micro_batch, height, width + INPAINT_CONTEXT_PX, device)
     rows = [measure_builtin(right, inpaint_mask, options)]
-    header = ("tier", "autoencoder", "pairs/s", "target", "encode ms", "U-Net ms", "decode ms", "TFLOP/s", "peak GiB", "micro-batch")
-    print_row(header)
-    print_row(("built-in", "", f"{rows[0]['pairs_per_second']:.1f}", "", "", "", "", "", gib(rows[0]["peak_bytes"]), options.micro_batch))
+    stages = [f"{stage} ms" for stage in STAGES]
+    print_row(("tier", "autoencoder", "pairs/s", "target", *stages, "TFLOP", "TFLOP/s", "of matmul", "peak GiB", "micro-batch"))
+    print_row(("built-in", "", f"{rows[0]['pairs_per_second']:.1f}", *[""] * 7, gib(rows[0]["peak_bytes"]), options.micro_batch))
     for autoencoder in ("full", "tiny"):
         tiny = str(folder / "pipeline" / "tiny") if autoencoder == "tiny" else None
         for steps in options.tiers:
             row = measure_tier(folder / "pipeline", tiny, steps, right, inpaint_mask, options)
             rows.append({"steps": steps, "autoencoder": autoencoder, **row})
-            target = None if options.smoke else TARGETS.get((steps, autoencoder))
-            stages = [f"{row[f'{stage}_ms']:.2f}" for stage in ("encode", "denoise", "decode")]
-            stages.append("" if row["tflops"] is None else f"{row['tflops']:.0f}")
-            wanted = "" if target is None else f"{target:g}"
+            target = TARGETS.get((steps, autoencoder)) if device.type == "cuda" else None
+            speed = row["tflop"] * row["pairs_per_second"]
             print_row(
                 (
                     f"{steps} steps",
                     autoencoder,
-                    f"{row['pairs_per_second']:.1f}",
-                    wanted,
-                    *stages,
+                    f"{row['pairs_per_second']:.3g}",
+                    "" if target is None else f"{target:g}",
+                    *(f"{row[f'{stage}_ms']:.3g}" for stage in STAGES),
+                    f"{row['tflop']:.3g}",
+                    f"{speed:.3g}",
+                    f"{speed / matmul:.2f}",
                     gib(row["peak_bytes"]),
                     row["micro_batch"],
                 )
@@ -176,26 +219,23 @@ def measure_tier(
 
     seconds, _ = timed(work, right.device, options.repeats)
     stages = stage_ms(inpainter, work, len(right), right.device)
-    tflops = None
-    if not options.compile:  # compiled code is not seen by the counter
-        with FlopCounterMode(display=False) as counter:
-            work()
-        tflops = counter.get_total_flops() / seconds / 1e12
+    tflop = count_tflop(work) / len(right)
     release(right.device)
     return {
         "pairs_per_second": len(right) / seconds,
         **stages,
-        "tflops": tflops,
+        "tflop": tflop,
         "peak_bytes": report.peak_bytes,
         "micro_batch": report.micro_batch,
     }
 
 
-def measure_depth(folder: Path, device: torch.device, options: argparse.Namespace) -> list[dict[str, Any]]:
+def measure_depth(folder: Path, device: torch.device, matmul: float, options: argparse.Namespace) -> list[dict[str, Any]]:
     sizes = SMALL_DEPTH_ANYTHING if options.smoke else DEPTH_ANYTHING_V2
     photo_size = (96, 128) if options.smoke else PHOTO
     photo = torch.from_numpy(np.random.default_rng(0).integers(0, 256, (1, 3, *photo_size), dtype=np.uint8))
-    print_row(("\ndepth, mirrored too", "photos/s", "target", "network ms", "prepare ms", "peak GiB"))
+    print()
+    print_row(("depth, mirrored too", "photos/s", "target", "network ms", "prepare ms", "TFLOP", "TFLOP/s", "of matmul", "peak GiB"))
     rows = []
     for name, size in sizes.items():
         save_depth(folder / name, size, device, 70 if options.smoke else 518)
@@ -205,14 +245,25 @@ def measure_depth(folder: Path, device: torch.device, options: argparse.Namespac
         inputs = [depth.prepare(photo).to(device)] * options.micro_batch
         work = lambda depth=depth, inputs=inputs: depth.predict_mirrored(inputs, [photo_size] * len(inputs))  # noqa: E731
         seconds, _ = timed(work, device, options.repeats)
-        rows.append(
-            {"network": name, "photos_per_second": len(inputs) / seconds, "prepare_ms": 1e3 * prepare, "peak_bytes": report.peak_bytes}
+        photos_per_second = len(inputs) / seconds
+        row = {"network": name, "photos_per_second": photos_per_second, "prepare_ms": 1e3 * prepare, "peak_bytes": report.peak_bytes}
+        row["tflop"] = count_tflop(work) / len(inputs)
+        rows.append(row)
+        target = DEPTH_TARGETS.get(name) if device.type == "cuda" else None
+        speed = row["tflop"] * photos_per_second
+        print_row(
+            (
+                f"{name} at {'x'.join(map(str, inputs[0].shape[-2:]))}",
+                f"{photos_per_second:.3g}",
+                "" if target is None else f"{target:g}",
+                f"{1e3 / photos_per_second:.3g}",
+                f"{row['prepare_ms']:.3g}",
+                f"{row['tflop']:.3g}",
+                f"{speed:.3g}",
+                f"{speed / matmul:.2f}",
+                gib(report.peak_bytes),
+            )
         )
-        target = DEPTH_TARGETS.get(name)
-        wanted = "" if target is None else f"{target:g}"
-        at = "x".join(map(str, inputs[0].shape[-2:]))
-        network_ms = f"{1e3 * seconds / len(inputs):.2f}"
-        print_row((f"{name} at {at}", f"{len(inputs) / seconds:.1f}", wanted, network_ms, f"{1e3 * prepare:.2f}", gib(report.peak_bytes)))
         del depth, work
         release(device)
     return rows
@@ -332,6 +383,13 @@ def stage_ms(inpainter: DiffusionInpainter, work: Callable[[], object], pairs: i
     with around_stages(inpainter, take_time):
         work()
     return {f"{stage}_ms": ms for stage, ms in spent.items()}
+
+
+def count_tflop(work: Callable[[], object]) -> float:
+    """The arithmetic of one run, in units of 1e12; compiled code runs uncompiled, the counter would not see into it."""
+    with torch.compiler.set_stance("force_eager"), FlopCounterMode(display=False) as counter:
+        work()
+    return counter.get_total_flops() / 1e12
 
 
 def release(device: torch.device) -> None:

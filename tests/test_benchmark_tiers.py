@@ -20,6 +20,8 @@ def test_the_smoke_run_measures_every_tier(tmp_path, capsys):
     assert tiers == [(0, None), (1, "full"), (4, "full"), (1, "tiny"), (4, "tiny")]
     assert all(row["pairs_per_second"] > 0 for row in figures["inpainting"])
     assert figures["depth"][0]["photos_per_second"] > 0
+    one, four = (row["tflop"] for row in figures["inpainting"][1:3])
+    assert 0 < one < four < 4 * one  # three steps more, encoding and decoding the same
     assert "4 steps" in capsys.readouterr().out
 
 
