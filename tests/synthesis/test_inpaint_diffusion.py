@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import asdict
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -226,6 +227,47 @@ def test_other_schedulers_run_and_repeat_themselves(folder, scheduler):
     made = inpainter(right, inpaint_mask, generators(0, 1))
     assert torch.isfinite(made).all() and inpainter.scheduler == SCHEDULERS.get(scheduler, scheduler)
     assert torch.equal(inpainter(right, inpaint_mask, generators(0, 1)), made)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 50])
+@pytest.mark.parametrize(
+    "scheduler", ["ddim", "dpm++", "euler", "lcm", "tcd", "DDPMScheduler", "EulerAncestralDiscreteScheduler", "HeunDiscreteScheduler"]
+)
+def test_noise_becomes_what_a_perfect_network_was_trained_on(folder, monkeypatch, scheduler, steps):
+    """A network that knows that all latents are drawn from N(0.5, 0.7) leads noise there: all but the spread in few steps."""
+    inpainter = load_inpainter(folder, steps=steps, scheduler=scheduler)
+    alphas = torch.linspace(0.00085**0.5, 0.012**0.5, 1000, dtype=torch.float64).square().neg().add(1).cumprod(0)
+
+    def predict_noise(noisy, timestep, encoder_hidden_states):
+        kept = alphas[round(float(timestep))]
+        noisy = noisy[:, :4].double()
+        clean = 0.5 + kept.sqrt() * 0.49 / (kept * 0.49 + 1 - kept) * (noisy - kept.sqrt() * 0.5)
+        return SimpleNamespace(sample=((noisy - kept.sqrt() * clean) / (1 - kept).sqrt()).float())
+
+    monkeypatch.setattr(inpainter._unet, "forward", predict_noise)
+    noise = latent_noise(1, 512, 512)
+    nothing = torch.zeros(1, 1, 64, 64), torch.zeros(1, 4, 64, 64)
+    latents = inpainter._denoise(noise, *nothing, [torch.Generator().manual_seed(0)], None)
+    assert abs(latents.mean() - 0.5) < 0.06
+    assert latents.std() < 0.75 and (steps < 50 or latents.std() > 0.45)
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"beta_schedule": None}, "lacks beta_schedule: the noise that its U-Net was trained with"),
+        ({"prediction_type": "flow_prediction"}, "prediction_type 'flow_prediction'"),
+        ({"use_flow_sigmas": True}, "use_flow_sigmas"),
+    ],
+)
+def test_a_pipeline_without_its_noise_schedule_is_refused(copy, config, message):
+    path = copy / "scheduler" / "scheduler_config.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **config}))
+    with pytest.raises(ValueError, match=message):
+        load_inpainter(copy)
+    path.write_text("{}")
+    with pytest.raises(ValueError, match="lacks beta_start, beta_end, beta_schedule"):
+        load_inpainter(copy)
 
 
 def test_eulers_steps_are_those_of_ddim(copy):
@@ -465,7 +507,9 @@ def test_a_name_that_is_nowhere_is_said(tmp_path):
     ("options", "message"),
     [
         ({"steps": 0}, "steps is 1 or more; got 0"),
-        ({"steps": 1001}, "1001"),
+        ({"steps": 1001}, "cannot make 1001 steps"),
+        ({"steps": 600}, "cannot make 600 steps: the first would stand at 600 of 1000"),
+        ({"scheduler": "lcm", "steps": 51}, "cannot make 51 steps: .*take another number of steps"),
         ({"dtype": "int8"}, "got int8"),
         ({"micro_batch": 0}, 'micro_batch is 1 or more, or "auto"; got 0'),
         ({"micro_batch": "all"}, "got 'all'"),
@@ -475,6 +519,8 @@ def test_a_name_that_is_nowhere_is_said(tmp_path):
         ({"scheduler": "NoScheduler"}, 'got "NoScheduler"'),
         ({"scheduler": "FlowMatchEulerDiscreteScheduler"}, "another kind of model"),
         ({"scheduler": "RePaintScheduler"}, "another kind of model"),
+        ({"scheduler": "DDIMInverseScheduler"}, "another kind of model"),
+        ({"scheduler": "CogVideoXDDIMScheduler"}, "another kind of model"),
     ],
 )
 def test_bad_options_are_refused(folder, options, message):
