@@ -93,6 +93,10 @@ def inpainter(folder):
     return load_inpainter(folder, steps=3)
 
 
+def change(config, **values):
+    config.write_text(json.dumps({**json.loads(config.read_text()), **values}))
+
+
 def scenes(count, height=48, width=64):
     """Images and ragged masks; the last part of each image is a strip of holes, as a warp leaves it."""
     random = np.random.default_rng(0)
@@ -262,7 +266,7 @@ def test_noise_becomes_what_a_perfect_network_was_trained_on(folder, monkeypatch
 )
 def test_a_pipeline_without_its_noise_schedule_is_refused(copy, config, message):
     path = copy / "scheduler" / "scheduler_config.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), **config}))
+    change(path, **config)
     with pytest.raises(ValueError, match=message):
         load_inpainter(copy)
     path.write_text("{}")
@@ -272,8 +276,7 @@ def test_a_pipeline_without_its_noise_schedule_is_refused(copy, config, message)
 
 def test_eulers_steps_are_those_of_ddim(copy):
     """Euler's method in units of sigma is DDIM in other words, once both end without noise; it scales its latents, and DDIM does not."""
-    path = copy / "scheduler" / "scheduler_config.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "set_alpha_to_one": True, "timestep_spacing": "leading"}))
+    change(copy / "scheduler" / "scheduler_config.json", set_alpha_to_one=True, timestep_spacing="leading")
     right, inpaint_mask = scenes(1)
     ddim, euler = (load_inpainter(copy, steps=5, scheduler=name)(right, inpaint_mask, generators(0)) for name in ("ddim", "euler"))
     assert torch.allclose(euler, ddim, rtol=0, atol=0.02)
@@ -479,8 +482,43 @@ def test_damaged_and_incomplete_weights_are_named(copy, part):
 
 def test_a_plain_text_to_image_unet_is_refused(copy):
     small_unet(4).save_pretrained(copy / "unet")
-    with pytest.raises(ValueError, match=r"no inpainting model: its U-Net takes 4 channels, inpainting takes 9"):
+    with pytest.raises(ValueError, match=r"no inpainting model: its U-Net takes 4 channels and gives 4, inpainting takes 9"):
         load_inpainter(copy)
+
+
+@pytest.mark.parametrize("condition", [{"time_cond_proj_dim": 8}, {"class_embed_type": "timestep"}, {"addition_embed_type": "text"}])
+def test_a_unet_that_wants_more_than_a_prompt_is_refused(copy, condition):
+    change(copy / "unet" / "config.json", **condition)
+    with pytest.raises(ValueError, match=rf"wants more than the empty prompt \({next(iter(condition))}"):
+        load_inpainter(copy)
+
+
+def test_weights_of_another_size_are_named(copy):
+    change(copy / "unet" / "config.json", block_out_channels=[16, 16, 16])
+    with pytest.raises(OSError, match="unet cannot be loaded"):
+        load_inpainter(copy)
+
+
+def test_weights_in_half_precision_alone_are_found(copy, inpainter):
+    for part in ("unet", "vae", "text_encoder"):
+        path = next((copy / part).glob("*.safetensors"))
+        save_file({name: weight.half() for name, weight in load_file(path).items()}, path, metadata={"format": "pt"})
+        path.rename(path.with_name(path.name.replace(".safetensors", ".fp16.safetensors")))
+    right, inpaint_mask = scenes(1)
+    made = load_inpainter(copy, steps=3)(right, inpaint_mask, generators(0))
+    assert 0 < (made - inpainter(right, inpaint_mask, generators(0))).abs().mean() < 1
+
+
+def test_a_tokenizer_without_its_vocabulary_is_refused(copy):
+    for name in ("vocab.json", "merges.txt"):
+        (copy / "tokenizer" / name).unlink()
+    with pytest.raises((ValueError, OSError), match=r"tokenizer (knows \d words|cannot be loaded)"):
+        load_inpainter(copy)
+
+
+def test_a_folder_has_no_revisions(copy):
+    with pytest.raises(ValueError, match=r'is a folder, which has no revisions; got revision="v9"'):
+        load_inpainter(copy, revision="v9")
 
 
 def test_an_autoencoder_of_another_latent_space_is_refused(folder, tmp_path):
@@ -489,6 +527,10 @@ def test_an_autoencoder_of_another_latent_space_is_refused(folder, tmp_path):
         load_inpainter(folder, autoencoder=str(tmp_path))
     with pytest.raises(ValueError, match="is a UNet2DConditionModel; an autoencoder here is one of"):
         load_inpainter(folder, autoencoder=str(folder / "unet"))
+    shutil.copytree(folder / "vae", tmp_path / "vae")
+    change(tmp_path / "vae" / "config.json", scaling_factor=0.13025)
+    with pytest.raises(ValueError, match=r"vae has scaling_factor 0\.13025: its latents are those of another model"):
+        load_inpainter(folder, autoencoder=str(tmp_path / "vae"))
 
 
 def test_a_text_encoder_of_another_pipeline_is_refused(copy):

@@ -18,7 +18,12 @@ from torch import Tensor
 
 CELL_PX = 8  # a latent cell is 8x8 pixels in every Stable Diffusion
 LATENT_CHANNELS = 4
+LATENT_SCALE = 0.18215
 INPAINTING_CHANNELS = 2 * LATENT_CHANNELS + 1  # noisy latent, mask, latent of the masked image
+
+# What a U-Net may be given beside the prompt; nothing here knows what to give.
+OTHER_CONDITIONS = ("addition_embed_type", "class_embed_type", "encoder_hid_dim_type", "num_class_embeds", "time_cond_proj_dim")
+SUGGESTION = "take ZeroStereo's checkpoint or Stable Diffusion 2 Inpainting"
 
 WEIGHTED_PARTS = ("unet", "vae", "text_encoder")
 OTHER_PARTS = ("scheduler", "tokenizer")
@@ -64,16 +69,13 @@ def load_diffusion_parts(
         from transformers import CLIPTextModel, CLIPTokenizerFast  # pyright: ignore[reportAttributeAccessIssue]
     except ImportError as error:
         raise ImportError(f'inpaint="{name}" needs diffusers and transformers: pip install "zsdata[diffusion]"') from error
-    _check_folder(name, subfolder, autoencoder)
+    _check_folder(name, subfolder, revision, autoencoder)
 
     scheduler_config: Any = _load(DDIMScheduler.load_config, name, subfolder, "scheduler", revision)
 
+    unet_config: Any = _load(UNet2DConditionModel.load_config, name, subfolder, "unet", revision)
+    _check_unet(name, unet_config)
     unet = _load_weights(UNet2DConditionModel, name, subfolder, "unet", revision, torch_dtype=dtype)
-    if unet.config.in_channels != INPAINTING_CHANNELS:
-        raise ValueError(
-            f'inpaint="{name}" is no inpainting model: its U-Net takes {unet.config.in_channels} channels, inpainting takes '
-            f"{INPAINTING_CHANNELS} (latent, mask, masked image); take ZeroStereo's checkpoint or Stable Diffusion 2 Inpainting"
-        )
 
     autoencoder_place = (name, subfolder, "vae", revision) if autoencoder is None else (autoencoder, "", "", None)
     autoencoders = {"AutoencoderKL": AutoencoderKL, "AutoencoderTiny": AutoencoderTiny}
@@ -90,10 +92,27 @@ def load_diffusion_parts(
             f"Stable Diffusion's latents are {LATENT_CHANNELS} channels of {CELL_PX}x{CELL_PX}"
         )
 
+    shifted = [key for key in ("shift_factor", "latents_mean", "latents_std") if config.get(key)]
+    other = autoencoder is not None and kind == "AutoencoderKL" and config.scaling_factor != LATENT_SCALE
+    if shifted or other:
+        raise ValueError(
+            f"{_where(*autoencoder_place[:3])} has {shifted[0] if shifted else f'scaling_factor {config.scaling_factor:g}'}: "
+            f"its latents are those of another model (Stable Diffusion's are scaled by {LATENT_SCALE} and not shifted); "
+            'leave autoencoder out, or take "stabilityai/sd-vae-ft-mse" or the tiny "madebyollin/taesd"'
+        )
+
     tokenizer = _load(CLIPTokenizerFast.from_pretrained, name, subfolder, "tokenizer", revision)
     text_encoder = _load_weights(CLIPTextModel, name, subfolder, "text_encoder", revision)
+    words = tokenizer("", padding=False, return_tensors="pt").input_ids
+    # Without its vocabulary a tokenizer loads all the same, with words of its own making.
+    if len(tokenizer) < text_encoder.config.vocab_size or words.tolist() != [[tokenizer.bos_token_id, tokenizer.eos_token_id]]:
+        raise ValueError(
+            f"{_where(name, subfolder, 'tokenizer')} knows {len(tokenizer)} words and makes {words.tolist()[0]} of an empty prompt; the "
+            f"text encoder knows {text_encoder.config.vocab_size}, and the prompt must be begin and end. Its vocabulary (tokenizer.json, "
+            "or vocab.json and merges.txt) is missing, or belongs to another pipeline: download it again"
+        )
     with torch.no_grad():
-        prompt = text_encoder.float()(tokenizer("", padding=False, return_tensors="pt").input_ids)[0]
+        prompt = text_encoder.float()(words)[0]
     if prompt.shape[-1] != unet.config.cross_attention_dim:
         raise ValueError(
             f'inpaint="{name}": the text encoder gives {prompt.shape[-1]} channels, the U-Net takes {unet.config.cross_attention_dim}; '
@@ -110,7 +129,7 @@ def _load(load: Any, name: str, subfolder: str, part: str, revision: str | None,
     try:
         inner = "/".join(filter(None, (subfolder, part)))
         return load(name, revision=revision, **({"subfolder": inner} if inner else {}), **options)
-    except (OSError, SafetensorError) as error:
+    except (OSError, SafetensorError, ValueError, RuntimeError, TypeError) as error:
         raise OSError(
             f"{_where(name, subfolder, part)} cannot be loaded. It must be there, complete, its weights (where it has any) in safetensors; "
             f"pickled .bin weights are refused, since they can run code. {type(error).__name__}: {error}"
@@ -118,10 +137,19 @@ def _load(load: Any, name: str, subfolder: str, part: str, revision: str | None,
 
 
 def _load_weights(network: Any, name: str, subfolder: str, part: str, revision: str | None, **options: Any) -> Any:
-    """A network with all of its weights; the libraries themselves fill gaps with random numbers and only log it."""
+    """A network with all of its weights; the libraries themselves fill gaps with random numbers and only log it.
+
+    Some pipelines hold their weights only in half precision, under names with "fp16".
+    """
     options |= {"use_safetensors": True, "output_loading_info": True}
     with torch.random.fork_rng(devices=[]):  # older transformers fill the weights with random numbers first
-        loaded, report = _load(network.from_pretrained, name, subfolder, part, revision, **options)
+        try:
+            loaded, report = _load(network.from_pretrained, name, subfolder, part, revision, **options)
+        except OSError as error:
+            try:
+                loaded, report = _load(network.from_pretrained, name, subfolder, part, revision, variant="fp16", **options)
+            except OSError:
+                raise error from None
     if report["missing_keys"]:
         missing = sorted(report["missing_keys"])
         raise ValueError(
@@ -131,8 +159,24 @@ def _load_weights(network: Any, name: str, subfolder: str, part: str, revision: 
     return loaded.eval().requires_grad_(False)
 
 
-def _check_folder(name: str, subfolder: str, autoencoder: str | None) -> None:
+def _check_unet(name: str, config: Mapping[str, Any]) -> None:
+    channels = config.get("in_channels"), config.get("out_channels")
+    if channels != (INPAINTING_CHANNELS, LATENT_CHANNELS):
+        raise ValueError(
+            f'inpaint="{name}" is no inpainting model: its U-Net takes {channels[0]} channels and gives {channels[1]}, inpainting takes '
+            f"{INPAINTING_CHANNELS} (latent, mask, masked image) and gives {LATENT_CHANNELS}; {SUGGESTION}"
+        )
+    if others := [f"{key}={config[key]}" for key in OTHER_CONDITIONS if config.get(key) is not None]:
+        raise ValueError(
+            f'inpaint="{name}": its U-Net wants more than the empty prompt ({", ".join(others)}), as Stable Diffusion XL and models '
+            f"distilled with guidance do; {SUGGESTION}"
+        )
+
+
+def _check_folder(name: str, subfolder: str, revision: str | None, autoencoder: str | None) -> None:
     """Says what a local folder lacks, before a library asks the Hub for it."""
+    if revision is not None and os.path.isdir(name):
+        raise ValueError(f'inpaint="{name}" is a folder, which has no revisions; got revision="{revision}": leave it out')
     for place in filter(None, (name, autoencoder)):
         if not os.path.isdir(place) and not re.fullmatch(r"[\w.-]+/[\w.-]+", place):
             raise FileNotFoundError(f'"{place}" is neither a folder nor a Hub id ("owner/name")')

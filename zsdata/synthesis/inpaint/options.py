@@ -20,7 +20,8 @@ class DiffusionNetwork:
             text encoder, tokenizer; weights in safetensors).
         steps: denoising steps, T in the paper.
         scheduler: "ddim" (the paper's), "dpm++", "euler", "lcm", "tcd", or a scheduler class of diffusers by name. It takes the noise
-            schedule from the pipeline's own scheduler configuration. LCM and TCD want a U-Net that was distilled for few steps.
+            schedule from the pipeline's own scheduler configuration, and the spacing of its timesteps, except that one to three steps
+            begin where the noise is ("trailing"). LCM and TCD want a U-Net that was distilled for few steps.
         subfolder: where in the repository or folder the pipeline lies: "StereoGen" in the paper's "Windsrain/ZeroStereo".
         revision: branch, tag or commit of a Hub id.
         autoencoder: a Hub id or folder of another autoencoder in the same latent space, such as the tiny "madebyollin/taesd".
