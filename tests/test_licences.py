@@ -1,6 +1,11 @@
 """Which model, at which revision, under which licence; and what commercial_safe refuses."""
 
 import json
+import os
+import subprocess
+import sys
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
@@ -83,6 +88,66 @@ def test_a_folder_without_a_card_is_known_by_its_name(tmp_path, hub_cache):
     snapshot = cached(hub_cache, "stabilityai/sd-turbo", "unet/config.json").parent
     assert model_record(str(snapshot))["licence"] == "sai-nc-community"
     assert model_record(str(tmp_path))["licence"] is None
+
+
+@pytest.mark.parametrize("file", ["config.json", "model_index.json", "unet/config.json"])
+def test_a_renamed_copy_is_known_by_what_it_was_loaded_from(tmp_path, file):
+    path = tmp_path / "mine" / file
+    path.parent.mkdir(parents=True)
+    path.write_text('{"_name_or_path": "stabilityai/sd-turbo"}')
+    assert model_record(str(tmp_path / "mine"))["licence"] == "sai-nc-community"
+    with pytest.raises(NonCommercialModel, match="sai-nc-community"):
+        require_commercial(DiffusionNetwork(str(tmp_path), subfolder="mine"), "inpaint")
+    for text in ('{"_name_or_path": 3}', "[]", "no json"):
+        path.write_text(text)
+        assert model_record(str(tmp_path / "mine"))["licence"] is None
+
+
+@pytest.mark.parametrize("name", ["sd_turbo", "SD-Turbo"])
+def test_a_copy_in_a_subfolder_is_known_by_its_name(tmp_path, name):
+    (tmp_path / name).mkdir()
+    for network in (DiffusionNetwork(str(tmp_path), subfolder=name), DiffusionNetwork(str(tmp_path / name))):
+        with pytest.raises(NonCommercialModel, match="sai-nc-community"):
+            require_commercial(network, "inpaint")
+
+
+def test_a_card_of_the_hub_is_looked_at_before_the_model_is_loaded(hub_cache, tmp_path, monkeypatch):
+    """The Hub is a web server of this machine that has one file."""
+    card = b"---\nlicense: cc-by-nc-4.0\n---\n"
+
+    class Hub(BaseHTTPRequestHandler):
+        def do_HEAD(self):
+            there = self.path == "/somebody/depth/resolve/main/README.md"
+            self.send_response(200 if there else 404)
+            if there:
+                for name, value in (("ETag", '"1"'), ("X-Repo-Commit", COMMIT), ("Content-Length", str(len(card)))):
+                    self.send_header(name, value)
+            else:
+                self.send_header("X-Error-Code", "EntryNotFound")
+            self.end_headers()
+
+        def do_GET(self):
+            self.do_HEAD()
+            self.wfile.write(card)
+
+        def log_message(self, *_):
+            pass
+
+    program = (
+        "from zsdata.licences import *\n"
+        'fetch_cards("somebody/depth", "somebody/else", "builtin", "stored", "Intel/dpt-large", DepthNetwork("not an id"))\n'
+        'print(model_record("somebody/depth"))\n'
+        'require_commercial("somebody/else", "depth")\n'
+        'require_commercial(DepthNetwork("somebody/depth"), "depth")\n'
+    )
+    with ThreadingHTTPServer(("127.0.0.1", 0), Hub) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        environment = {name: value for name, value in os.environ.items() if name not in ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE")}
+        environment |= {"HF_ENDPOINT": f"http://127.0.0.1:{server.server_port}", "HF_HUB_CACHE": str(hub_cache)}
+        done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=120)
+        server.shutdown()
+    assert str({"id": "somebody/depth", "revision": COMMIT, "licence": "cc-by-nc-4.0"}) in done.stdout, done.stderr
+    assert 'NonCommercialModel: depth="somebody/depth" is under cc-by-nc-4.0' in done.stderr
 
 
 def test_every_model_of_a_step_is_recorded():

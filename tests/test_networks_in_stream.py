@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from tests.scenes import grey_fill, layered_depth, photo_tar
-from zsdata import ZeroStereoStream
+from zsdata import ZeroStereoStream, load_depth
 from zsdata.licences import NonCommercialModel
 from zsdata.synthesis.depth import DepthNetwork
 from zsdata.synthesis.inpaint import DiffusionNetwork
+from zsdata.synthesis.micro_batch import GIB, WarmUp
 
 small = pytest.importorskip("tests.small_depth_networks")
 
@@ -107,6 +108,34 @@ def test_options_that_change_no_picture_do_not_change_the_place(folder, tar):
     ZeroStereoStream(tar, size=SIZE, depth=DepthNetwork(str(folder), micro_batch=16)).load_state_dict(state)
     with pytest.raises(ValueError, match="configuration"):
         ZeroStereoStream(tar, size=SIZE, depth=DepthNetwork(str(folder), resolution=42)).load_state_dict(state)
+
+
+@pytest.mark.parametrize(("options", "loader", "samples"), [({}, {}, 8), ({"reuse": 3}, {}, 4), ({}, {"micro_batch": 2}, 2)])
+def test_networks_are_warmed_up_for_the_pairs_that_a_batch_has_and_say_so(tar, capsys, options, loader, samples):
+    """On a pretended device: torch's "meta" has no memory and computes nothing."""
+
+    class Inpainter:
+        def warm_up(self, size, most):
+            return WarmUp(f"inpainting {most} pairs at {size}", most, 3 * GIB, GIB, 0.5)
+
+        def __call__(self, right, inpaint_mask, generators):
+            return right
+
+    stream = ZeroStereoStream(tar, size=SIZE, depth=layered_depth, inpaint=Inpainter(), epoch_size=16, **options)
+    stream.loader(8, device="meta", **loader)
+    assert capsys.readouterr().err.splitlines() == [
+        f"zsdata on meta: inpainting {samples} pairs at (64, 128): micro-batch {samples}, peak memory 3.00 GiB, warm after 0.5 s",
+        "zsdata on meta: the stream takes at most 3.00 GiB beside training",
+    ]
+    stream.loader(8, device="meta", rank=1, world_size=2, **loader)
+    assert capsys.readouterr().err == ""  # once for all ranks
+
+
+def test_loaded_networks_count_by_their_options(folder, tar):
+    def configuration(**options):
+        return ZeroStereoStream(tar, size=SIZE, depth=load_depth(folder, **options)).provenance()["configuration"]
+
+    assert configuration() == configuration(micro_batch=2) != configuration(resolution=42)
 
 
 def test_provenance_names_the_models_with_their_licences(folder, tar):

@@ -100,13 +100,17 @@ class Finisher:
         networks = [self.inpainter, None if self.synthesis is None else self.synthesis.depth]
         return sum(getattr(getattr(network, "micro_batch", None), "lowered", 0) for network in networks)
 
-    def warm_up(self, size: tuple[int, int]) -> list[Any]:
-        """Makes the networks ready for crops of this (height, width), as training has memory and no time then; what each of them says."""
+    def warm_up(self, size: tuple[int, int], batch_size: int) -> list[Any]:
+        """Makes the networks ready for batches of crops of this (height, width), while training has memory and time to spare; what each of
+        them says."""
         height, width = size
-        steps: list[tuple[Any, tuple[int, int]]] = [(self.inpainter, (height, width + INPAINT_CONTEXT_PX))]
+        pairs = 1 + -(-(batch_size - 1) // self.reuse)  # the most distinct ones that a batch can have
+        steps: list[tuple[Any, tuple[int, int], int]] = [
+            (self.inpainter, (height, width + INPAINT_CONTEXT_PX), min(pairs, self.micro_batch or pairs))
+        ]
         if self.synthesis is not None:
-            steps.append((self.synthesis.depth, size))
-        return [step.warm_up(area) for step, area in steps if hasattr(step, "warm_up")]
+            steps.append((self.synthesis.depth, size, pairs))
+        return [step.warm_up(area, samples) for step, area, samples in steps if hasattr(step, "warm_up")]
 
     @torch.no_grad()
     def __call__(self, prepared: Prepared | Drafts, meter: Meter) -> StereoBatch:

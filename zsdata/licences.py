@@ -5,17 +5,22 @@ What is said here is what the model cards say, as far as they are at hand: a rec
 
 from __future__ import annotations
 
+import json
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import yaml
-from huggingface_hub import metadata_load, try_to_load_from_cache
+from huggingface_hub import hf_hub_download, metadata_load, try_to_load_from_cache
+from huggingface_hub.errors import HfHubHTTPError
 
 from zsdata.synthesis.depth.options import STORED, DepthNetwork
 from zsdata.synthesis.inpaint.options import DiffusionNetwork
 
+CARD = "README.md"
+HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
 OWN_LICENCE = "apache-2.0"
 BUILT_IN = ("builtin", "background")
 
@@ -68,18 +73,18 @@ def model_record(name: str, revision: str | None = None, subfolder: str = "") ->
         subfolder: where in it the model lies.
 
     Returns:
-        `licence` is what the model card (README.md of the folder, or in the Hub cache) says; without a card what is known of that id or of
-        a folder named as one; None where nothing is.
+        `licence` is what the model card (README.md of the folder, or in the Hub cache) says; without a card what is known of that id, of a
+        folder named as one, or of a model that the folder's configuration says it was made from; None where nothing is.
     """
     if name in BUILT_IN:
         return {"id": name, "revision": None, "licence": OWN_LICENCE}
     if name == STORED:
         return {"id": name, "revision": None, "licence": None}
-    if os.path.isdir(name):
-        return {"id": name, "revision": revision, "licence": _card_licence(Path(name), Path(name, subfolder)) or _known_licence(name)}
-    snapshot = _snapshot(name, revision, subfolder)
-    licence = None if snapshot is None else _card_licence(snapshot)
-    return {"id": name, "revision": revision if snapshot is None else snapshot.name, "licence": licence or _known_licence(name)}
+    folder = Path(name) if os.path.isdir(name) else _snapshot(name, revision, subfolder)
+    licence = None if folder is None else _card_licence(folder, folder / subfolder)
+    if folder is not None and not os.path.isdir(name):
+        revision = folder.name
+    return {"id": name, "revision": revision, "licence": licence or next(_known_licences(name, subfolder), None)}
 
 
 def model_records(step: Any) -> list[dict[str, str | None]]:
@@ -90,16 +95,40 @@ def model_records(step: Any) -> list[dict[str, str | None]]:
             network's.
     """
     network = getattr(step, "network", step)
-    if isinstance(network, DepthNetwork):
-        return [model_record(network.name, network.revision)]
-    if isinstance(network, DiffusionNetwork):
-        records = [model_record(network.name, network.revision, network.subfolder)]
-        return records + ([model_record(network.autoencoder)] if network.autoencoder is not None else [])
+    if isinstance(network, DepthNetwork | DiffusionNetwork):
+        return [model_record(*model) for model in _models(network)]
     if isinstance(network, str | os.PathLike):
         return [model_record(os.fspath(network))]
     kind = network if hasattr(network, "__qualname__") else type(network)
     own = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
     return [{"id": f"{kind.__module__}.{kind.__qualname__}", "revision": None, "licence": OWN_LICENCE if own else None}]
+
+
+def _models(step: Any) -> list[tuple[str, str | None, str]]:
+    """(name, revision, subfolder) of every model behind a name, a path, a DepthNetwork or a DiffusionNetwork."""
+    network = getattr(step, "network", step)
+    if isinstance(network, DepthNetwork):
+        return [(network.name, network.revision, "")]
+    if isinstance(network, DiffusionNetwork):
+        other = [] if network.autoencoder is None else [(network.autoencoder, None, "")]
+        return [(network.name, network.revision, network.subfolder), *other]
+    return [(os.fspath(network), None, "")] if isinstance(network, str | os.PathLike) else []
+
+
+def fetch_cards(*steps: Any) -> None:
+    """Downloads the model cards of Hub ids whose licence is not known here, into the Hub's cache; where that fails they stay unknown.
+
+    Args:
+        steps: as `model_records` takes them.
+    """
+    for name, revision, _ in (model for step in steps for model in _models(step)):
+        if name in (*BUILT_IN, STORED) or os.path.isdir(name) or name.lower() in KNOWN or not HUB_ID.fullmatch(name):
+            continue
+        if try_to_load_from_cache(name, CARD, revision=revision) is None:  # neither there nor known to be missing
+            try:
+                hf_hub_download(name, CARD, revision=revision)
+            except (OSError, ValueError, HfHubHTTPError):  # no network, no such repository, no card; loading the model says what is wrong
+                continue
 
 
 def require_commercial(step: Any, argument: str) -> None:
@@ -112,33 +141,44 @@ def require_commercial(step: Any, argument: str) -> None:
     Raises:
         NonCommercialModel: it names the model, its licence and alternatives.
     """
-    for record in model_records(step):
-        said = [record["licence"], _known_licence(record["id"] or "")]
+    for name, revision, subfolder in _models(step):
+        said = [model_record(name, revision, subfolder)["licence"], *_known_licences(name, subfolder)]
         refused = next((licence for licence in said if licence is not None and NON_COMMERCIAL.search(licence)), None)
         if refused is not None:
             raise NonCommercialModel(
-                f'{argument}="{record["id"]}" is under {refused}, which allows no commercial use, and commercial_safe is set. '
+                f'{argument}="{name}" is under {refused}, which allows no commercial use, and commercial_safe is set. '
                 f"Take {ALTERNATIVES[argument]}, or leave commercial_safe out"
             )
 
 
-def _known_licence(name: str) -> str | None:
-    """Of a Hub id, of a folder that has the last part of its name, or of a snapshot in the Hub's cache."""
-    if name.lower() in KNOWN:
-        return KNOWN[name.lower()]
+def _known_licences(name: str, subfolder: str) -> Iterator[str]:
+    """Of a Hub id; of a folder what its name, its place in the Hub's cache and its configurations say that it is, or was made from."""
     if not os.path.isdir(name):
-        return None
+        yield from filter(None, [KNOWN.get(name.lower())])
+        return
     parts = Path(os.path.realpath(name)).parts
     cached = [part.removeprefix("models--").replace("--", "/") for part in parts if part.startswith("models--")]
-    if cached:
-        return KNOWN.get(cached[-1].lower())
-    return next((licence for known, licence in KNOWN.items() if known.rpartition("/")[2] == parts[-1].lower()), None)
+    origins = [KNOWN.get(origin.lower()) for origin in (*cached[-1:], *_origins(Path(name, subfolder)))]
+    folders = {part.lower().replace("_", "-") for part in (*parts[-1:], *Path(subfolder).parts)} if not cached else set()
+    yield from filter(None, origins)
+    yield from (licence for known, licence in KNOWN.items() if known.rpartition("/")[2] in folders)
+
+
+def _origins(folder: Path) -> Iterator[str]:
+    """What the configurations in a folder name as the models that they were loaded from."""
+    for path in (folder / "config.json", folder / "model_index.json", *sorted(folder.glob("*/config.json"))):
+        try:
+            config = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError):  # not there, or not JSON: loading the model says so
+            continue
+        if isinstance(config, dict) and isinstance(config.get("_name_or_path"), str):
+            yield config["_name_or_path"]
 
 
 def _card_licence(*folders: Path) -> str | None:
     """Of the first of the folders that has a model card with a licence."""
     for folder in folders:
-        card = folder / "README.md"
+        card = folder / CARD
         if not card.is_file():
             continue
         try:
@@ -155,9 +195,8 @@ def _card_licence(*folders: Path) -> str | None:
 
 def _snapshot(name: str, revision: str | None, subfolder: str) -> Path | None:
     """Where the Hub's cache keeps that revision; its name is the commit."""
-    files = ("config.json", "unet/config.json")  # of a transformers network or an autoencoder, and of a pipeline
-    for file in files:
-        inner = f"{subfolder}/{file}" if subfolder else file
+    # Of a transformers network or an autoencoder, of a pipeline, and of whatever is not loaded yet.
+    for inner in (*(f"{subfolder}/{file}".lstrip("/") for file in ("config.json", "unet/config.json")), CARD):
         try:
             found = try_to_load_from_cache(name, inner, revision=revision)
         except ValueError as error:

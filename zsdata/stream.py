@@ -6,6 +6,7 @@ import hashlib
 import json
 import logging
 import os
+import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, replace
@@ -18,11 +19,12 @@ from torch.utils.data import IterableDataset, get_worker_info
 from zsdata.augment import AugmentConfig
 from zsdata.faults import FailureBudget, FaultLog
 from zsdata.finish import Finisher, Synthesis
-from zsdata.licences import model_records, require_commercial
+from zsdata.licences import fetch_cards, model_records, require_commercial
 from zsdata.loader import SAMPLE_TIMEOUT_SECONDS, StereoLoader
 from zsdata.meter import Meter
 from zsdata.position import Position
 from zsdata.prepared import Draft, Prepared, stack
+from zsdata.progress import Progress
 from zsdata.quality import QualityGate
 from zsdata.sample import StereoBatch
 from zsdata.source.shard_cache import ShardCache
@@ -35,6 +37,7 @@ from zsdata.synthesis.depth.options import STORED
 from zsdata.synthesis.depth.pretrained import load_preprocessing
 from zsdata.synthesis.disparity import AdaptiveDisparity, UniformDisparity
 from zsdata.synthesis.inpaint import DiffusionNetwork, Inpainter, load_inpainter
+from zsdata.synthesis.micro_batch import WarmUp, say_warm_up
 from zsdata.synthesis.synthesizer import SynthesisConfig
 from zsdata.synthesis.view import ViewConfig
 from zsdata.worker import Recipe, Worker
@@ -152,6 +155,7 @@ class ZeroStereoStream(IterableDataset):
             if not isinstance(depth, str) or depth in ("builtin", STORED):
                 raise ValueError(f"depth_resolution belongs to a network given by name or folder; depth is {_name_of(depth)!r}")
             depth = DepthNetwork(depth, resolution=depth_resolution)
+        fetch_cards(depth, self._inpaint)
         if commercial_safe:
             require_commercial(depth, "depth")
             require_commercial(self._inpaint, "inpaint")
@@ -270,8 +274,9 @@ class ZeroStereoStream(IterableDataset):
             on_device = device.type != "cpu" and as_network(self._recipe.depth) is not None
         finisher = self._finisher(device, micro_batch, on_device)
         if device.type != "cpu" and self._recipe.size is not None:
-            for ready in finisher.warm_up(self._recipe.size):
-                logger.info("%s", ready)
+            ready = [said for said in finisher.warm_up(self._recipe.size, batch_size) if isinstance(said, WarmUp)]
+            if ready and rank == 0:
+                Progress.write(say_warm_up(ready, device), file=sys.stderr)
         return StereoLoader(
             worker=Worker(replace(self._recipe, depth_on_device=True)) if on_device else self._worker,
             finisher=finisher,
@@ -394,6 +399,9 @@ def _open_cache(
 
 def _name_of(step: Any) -> Any:
     """What a step is called in the configuration's digest: what changes its pictures, and nothing else."""
+    loaded = getattr(step, "network", None)
+    if isinstance(loaded, DepthNetwork | DiffusionNetwork):
+        step = loaded
     if isinstance(step, DepthNetwork | DiffusionNetwork):
         return {name: value for name, value in asdict(step).items() if name not in ("compile", "micro_batch", "memory_gib")}
     return step if isinstance(step, str) else f"{type(step).__module__}.{getattr(step, '__qualname__', type(step).__qualname__)}"

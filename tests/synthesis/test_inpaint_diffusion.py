@@ -425,6 +425,41 @@ def test_auto_takes_what_the_budget_allows(folder, monkeypatch):
     assert report.seconds == 2
 
 
+@pytest.mark.parametrize(
+    ("samples", "tried", "found"), [(2, [1, 2, 2], 2), (6, [1, 2, 4, 3], 3), (3, [1, 2, 2], 2), (100, [1, 2, 4, 4], 4)]
+)
+def test_auto_takes_no_more_than_will_come_and_divides_it_evenly(folder, monkeypatch, samples, tried, found):
+    """On a pretended GPU where four samples fit: six come as three and three."""
+    inpainter, seen = load_inpainter(folder, memory_gib=1.2), []
+    monkeypatch.setattr(inpainter, "_try", lambda count, size: seen.append(count))
+    monkeypatch.setattr(diffusion, "measure", lambda work, device: (work(), (seen[-1] * 2**28, 0.5))[1])
+    monkeypatch.setattr(inpainter, "_to_be_found", True)
+    assert inpainter.warm_up((48, 64), samples).micro_batch == found and seen[: len(tried)] == tried
+
+
+def test_a_memory_limit_that_cannot_be_held_is_said(folder, monkeypatch, caplog):
+    inpainter = load_inpainter(folder, memory_gib=0.1)
+    monkeypatch.setattr(diffusion, "measure", lambda work, device: (2**28, 0.5))
+    monkeypatch.setattr(inpainter, "_to_be_found", True)
+    with caplog.at_level(logging.WARNING, "zsdata"):
+        assert inpainter.warm_up((48, 64)).micro_batch == 1
+    assert "memory_gib=0.1 cannot be held: one sample and the weights take 0.25 GiB" in caplog.text
+
+
+@pytest.mark.filterwarnings("ignore:.*script_method.*:DeprecationWarning")  # PyTorch's own compiler
+def test_a_compiled_network_sees_one_size_alone(folder, inpainter, monkeypatch):
+    """Whatever number of samples has holes; another size would be compiled anew in the middle of training."""
+    right, inpaint_mask = scenes(5)
+    compiled, seen = load_inpainter(folder, steps=3, compile=True), []
+    compiled.micro_batch.size = 3
+    unet = compiled._unet.forward
+    monkeypatch.setattr(compiled._unet, "forward", lambda noisy, *_, **__: seen.append(len(noisy)) or unet(noisy, *_, **__))
+    with torch.compiler.set_stance("force_eager"):
+        made = compiled(right, inpaint_mask, generators(*range(5)))
+    assert set(seen) == {3}
+    assert torch.allclose(made, inpainter(right, inpaint_mask, generators(*range(5))), rtol=0, atol=1e-4 * 127.5)
+
+
 def test_no_samples_are_no_work(inpainter):
     right, inpaint_mask = scenes(1)
     assert inpainter(right[:0], inpaint_mask[:0], []).shape == (0, 3, 48, 64)

@@ -1,12 +1,13 @@
 """How many samples at once: as many as fit, found without failing, lowered where memory runs out after all."""
 
 import logging
+import weakref
 from itertools import chain
 
 import pytest
 import torch
 
-from zsdata.synthesis.micro_batch import GIB, MicroBatch, WarmUp, largest_micro_batch, measure, weight_bytes
+from zsdata.synthesis.micro_batch import GIB, MicroBatch, WarmUp, largest_micro_batch, measure, say_warm_up, to_device, weight_bytes
 
 GPU = torch.device("meta")  # a device that is not the CPU and is everywhere
 
@@ -59,6 +60,49 @@ def test_one_sample_that_does_not_fit_is_an_error_with_the_cure():
     assert isinstance(raised.value.__cause__, torch.OutOfMemoryError)
 
 
+@pytest.mark.parametrize("said", ["CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate`", "CUDA error: out of memory"])
+def test_libraries_below_torch_say_it_otherwise(said):
+    batch, tried = MicroBatch("network", 4, GPU, "cure"), []
+
+    def work(part):
+        tried.append(part.stop - part.start)
+        if tried == [4]:
+            raise RuntimeError(said)
+
+    batch.run(work, 4)
+    assert tried == [4, 2, 2] and batch.lowered == 1
+
+
+def test_other_errors_are_not_taken_for_it():
+    def work(part):
+        raise RuntimeError("the size of tensor a must match the size of tensor b")
+
+    with pytest.raises(RuntimeError, match="tensor a"):
+        MicroBatch("network", 4, GPU, "cure").run(work, 4)
+
+
+def test_what_failed_is_let_go_before_the_next_try():
+    batch, alive = MicroBatch("network", 2, GPU, "cure"), []
+
+    def work(part):
+        if part.stop - part.start == 2:
+            activations = torch.zeros(1)
+            alive.append(weakref.ref(activations))
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        assert alive[0]() is None
+
+    batch.run(work, 2)
+
+
+def test_networks_that_do_not_fit_say_what_to_lower():
+    class TooLarge(torch.nn.Linear):
+        def to(self, *_, **__):
+            raise torch.OutOfMemoryError("CUDA out of memory")
+
+    with pytest.raises(MemoryError, match=r"not enough memory for inpainting, whose weights take 0\.50 GiB: take less"):
+        to_device([TooLarge(2**14, 2**13, bias=False, device="meta")], GPU, "inpainting", "take less")
+
+
 @pytest.mark.parametrize(
     ("budget", "most", "expected"),
     [(0, 16, 1), (119, 16, 1), (239, 16, 1), (240, 16, 2), (419, 16, 2), (420, 16, 4), (10_000, 16, 16), (10_000, 6, 4)],
@@ -79,7 +123,14 @@ def test_work_that_needs_more_than_foretold_stays_where_it_fits():
 
 
 def test_a_warm_up_can_be_read():
-    assert str(WarmUp("unet at 384x512", 8, 3 * GIB // 2, 2.34)) == "unet at 384x512: micro-batch 8, peak memory 1.50 GiB, warm after 2.3 s"
+    unet = WarmUp("unet at 384x512", 8, 3 * GIB // 2, GIB, 2.34)
+    assert str(unet) == "unet at 384x512: micro-batch 8, peak memory 1.50 GiB, warm after 2.3 s"
+    depth = WarmUp("depth at 518x686", 8, 2 * GIB, GIB // 4, 1)
+    assert say_warm_up([unet, depth], torch.device("cuda:1")).splitlines() == [
+        "zsdata on cuda:1: unet at 384x512: micro-batch 8, peak memory 1.50 GiB, warm after 2.3 s",
+        "zsdata on cuda:1: depth at 518x686: micro-batch 8, peak memory 2.00 GiB, warm after 1.0 s",
+        "zsdata on cuda:1: the stream takes at most 3.00 GiB beside training",  # both weights, and depth's activations
+    ]
 
 
 def test_the_cpu_counts_no_memory():

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
 import torch
@@ -28,17 +28,29 @@ class WarmUp(NamedTuple):
         what: the network and the size that it was tried at.
         micro_batch: samples that go through it at once.
         peak_bytes: the most device memory that weights and activations take together; None where the device does not count it (the CPU).
+        weights: bytes of the weights alone.
         seconds: how long the warm-up took.
     """
 
     what: str
     micro_batch: int
     peak_bytes: int | None
+    weights: int
     seconds: float
 
     def __str__(self) -> str:
         peak = "" if self.peak_bytes is None else f", peak memory {self.peak_bytes / GIB:.2f} GiB"
         return f"{self.what}: micro-batch {self.micro_batch}{peak}, warm after {self.seconds:.1f} s"
+
+
+def say_warm_up(ready: Sequence[WarmUp], device: torch.device) -> str:
+    """What the networks of a stream said of their warm-up, a line each; and how much memory of the device they take in all."""
+    lines = [f"zsdata on {device}: {said}" for said in ready]
+    activations = [said.peak_bytes - said.weights for said in ready if said.peak_bytes is not None]
+    if activations:
+        peak = sum(said.weights for said in ready) + max(activations)  # weights stay, activations come one after another
+        lines.append(f"zsdata on {device}: the stream takes at most {peak / GIB:.2f} GiB beside training")
+    return "\n".join(lines)
 
 
 class MicroBatch:
@@ -68,15 +80,20 @@ class MicroBatch:
         start = 0
         while start < total:
             stop = min(start + self.size, total)
+            failed = None
             try:
                 made.append(work(slice(start, stop)))
-            except torch.OutOfMemoryError as error:
-                self._lower(stop - start, error)
-                continue
-            start = stop
+            except RuntimeError as error:
+                if not out_of_memory(error):
+                    raise
+                failed = error.with_traceback(None)  # its frames hold what there was no memory for
+            if failed is None:
+                start = stop
+            else:
+                self._lower(stop - start, failed)
         return made
 
-    def _lower(self, tried: int, error: torch.OutOfMemoryError) -> None:
+    def _lower(self, tried: int, error: RuntimeError) -> None:
         self.lowered += 1
         if tried == 1:
             raise MemoryError(f"{self.device} has not enough memory for one sample ({self.what}): {self.cure}") from error
@@ -92,6 +109,27 @@ class MicroBatch:
         )
         if self.device.type == "cuda":
             torch.cuda.empty_cache()
+
+
+def out_of_memory(error: RuntimeError) -> bool:
+    """Whether it is torch's own error of that kind, or one of the libraries below it."""
+    return isinstance(error, torch.OutOfMemoryError) or "ALLOC_FAILED" in str(error) or "out of memory" in str(error)
+
+
+def to_device(networks: Sequence[torch.nn.Module], device: torch.device, what: str, cure: str) -> None:
+    """Puts networks on the device.
+
+    Raises:
+        MemoryError: they do not fit; `what` they are and the `cure` are said.
+    """
+    try:
+        for network in networks:
+            network.to(device)
+    except RuntimeError as error:
+        if not out_of_memory(error):
+            raise
+        takes = weight_bytes(*networks) / GIB
+        raise MemoryError(f"{device} has not enough memory for {what}, whose weights take {takes:.2f} GiB: {cure}") from error
 
 
 def largest_micro_batch(peak_bytes: Callable[[int], int], budget_bytes: int, most: int = LARGEST_AUTO) -> int:

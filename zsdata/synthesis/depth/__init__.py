@@ -4,8 +4,8 @@ A depth estimator is anything that maps images, float32 [B, 3, H, W] RGB 0..255,
 in any scale and offset. It is normalised per photo afterwards.
 
 One that has more to offer is asked for it: `with_mirrored(images) -> (inverse_depth, mirrored)` estimates photo and mirrored photo
-together; `prepare` and `predict_mirrored` let its two halves run in two places; `warm_up(size)` makes it ready and says what memory it
-takes (see `PretrainedDepth`).
+together; `prepare` and `predict_mirrored` let its two halves run in two places; `warm_up(size, samples)` makes it ready and says what
+memory it takes (see `PretrainedDepth`).
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from zsdata.synthesis.depth.options import DepthNetwork
 from zsdata.synthesis.depth.preprocessing import Preprocessing, read_preprocessing
-from zsdata.synthesis.micro_batch import MicroBatch, WarmUp, measure, weight_bytes
+from zsdata.synthesis.micro_batch import MicroBatch, WarmUp, measure, to_device, weight_bytes
 from zsdata.synthesis.precision import choose_dtype
 
 # What a network's prediction is, by the model_type of its configuration. Depth Pro's is inverse depth: transformers inverts it afterwards.
@@ -62,7 +62,9 @@ class PretrainedDepth:
         if missing:
             raise ValueError(f'depth="{name}" lacks {len(missing)} weights, "{missing[0]}" for one; download it again')
         self._predicts_depth = (network.predicts or _predicts(name, loaded.config)) == "depth"
-        self._network: Any = loaded.to(self.device, torch.float32).eval().requires_grad_(False)  # saved in half precision or not
+        self._network: Any = loaded.float().eval().requires_grad_(False)  # saved in half precision or not
+        cure = "lower resolution, or take a smaller network or dtype"
+        to_device((self._network,), self.device, "the depth network", cure)
         if self.device.type == "cuda":
             self._network.to(memory_format=torch.channels_last)
         if self.dtype != torch.float32:
@@ -70,9 +72,7 @@ class PretrainedDepth:
                 _keep_in_float32(layers, self.device.type)
         if network.compile:
             self._network.compile()
-        self.micro_batch = MicroBatch(
-            "depth network", network.micro_batch, self.device, "lower resolution, or take a smaller network or dtype"
-        )
+        self.micro_batch = MicroBatch("depth network", network.micro_batch, self.device, cure)
 
     def prepare(self, images: Tensor) -> Tensor:
         """The first half: photos to the network's input.
@@ -141,12 +141,20 @@ class PretrainedDepth:
         depth, mirrored = (torch.cat(maps).to(images.device) for maps in zip(*made, strict=True))
         return depth, mirrored
 
-    def warm_up(self, size: tuple[int, int]) -> WarmUp:
-        """Runs one whole micro-batch of grey photos of this (height, width), and says how much memory that takes."""
+    def warm_up(self, size: tuple[int, int], samples: int | None = None) -> WarmUp:
+        """Runs one micro-batch of grey photos of this (height, width), and says how much memory that takes.
+
+        Args:
+            size: height and width of the photos.
+            samples: the most photos that will come at once, each with its mirror image; None is not known.
+        """
+        if samples is not None:
+            self.micro_batch.size = min(self.micro_batch.size, 2 * samples)
         inputs = [self.prepare(torch.full((1, 3, *size), 127, dtype=torch.uint8))] * self.micro_batch.size
         peak, seconds = measure(lambda: self.predict(inputs, [size] * len(inputs)), self.device)
         what = f"depth {self.network.name} at {inputs[0].shape[-2]}x{inputs[0].shape[-1]}, {self.dtype}"
-        return WarmUp(what, self.micro_batch.size, None if peak is None else peak + weight_bytes(self._network), seconds)
+        weights = weight_bytes(self._network)
+        return WarmUp(what, self.micro_batch.size, None if peak is None else peak + weights, weights, seconds)
 
     def _run(self, inputs: Tensor) -> Tensor:
         """uint8 [B, 3, h, w] on the device to inverse depth, float32 [B, 1, h', w']."""

@@ -3,7 +3,7 @@
 An inpainter is anything with `__call__(right, inpaint_mask, generators) -> right`: right is float32 [B, 3, H, W] RGB 0..255, inpaint_mask
 bool [B, 1, H, W], True in the holes, and generators holds one numpy Generator per sample. One that wants to know more lists it in `needs`
 and gets it by keyword: `right_disparity` (float32 [B, 1, H, W], 0 in holes) or `background` (another photo of the same source at the
-crop's size, float32 [B, 3, H, W]). One that has to get ready has `warm_up(size)` (see `DiffusionInpainter`).
+crop's size, float32 [B, 3, H, W]). One that has to get ready has `warm_up(size, samples)` (see `DiffusionInpainter`).
 """
 
 from __future__ import annotations

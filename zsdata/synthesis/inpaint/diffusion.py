@@ -8,6 +8,7 @@ to latent size by nearest neighbour: here a cell is known only if every pixel in
 from __future__ import annotations
 
 import inspect
+import logging
 import sys
 from collections.abc import Sequence
 from copy import deepcopy
@@ -21,8 +22,22 @@ from torch import Tensor
 from zsdata.synthesis.inpaint.diffusion_parts import CELL_PX, LATENT_CHANNELS, load_diffusion_parts
 from zsdata.synthesis.inpaint.options import DiffusionNetwork
 from zsdata.synthesis.inpaint.schedulers import make_scheduler
-from zsdata.synthesis.micro_batch import AUTO_SHARE, GIB, MicroBatch, WarmUp, free_bytes, largest_micro_batch, measure, weight_bytes
+from zsdata.synthesis.micro_batch import (
+    AUTO_SHARE,
+    GIB,
+    LARGEST_AUTO,
+    MicroBatch,
+    WarmUp,
+    free_bytes,
+    largest_micro_batch,
+    measure,
+    out_of_memory,
+    to_device,
+    weight_bytes,
+)
 from zsdata.synthesis.precision import choose_dtype
+
+logger = logging.getLogger("zsdata")
 
 AUTOENCODER_BATCH = 4  # images; at full resolution they keep a GPU busy, and more would take most of the memory
 TRIAL_STEPS = 2  # of a warm-up: all steps take the same memory, and some schedulers do more from the second one on
@@ -46,6 +61,7 @@ class DiffusionInpainter:
     Raises:
         ImportError: the "diffusion" extra is not installed.
         OSError, ValueError: what `load_diffusion_parts` and `make_scheduler` raise.
+        MemoryError: the networks do not fit into the device's memory.
     """
 
     def __init__(self, network: DiffusionNetwork, device: str | torch.device = "cpu") -> None:
@@ -55,15 +71,14 @@ class DiffusionInpainter:
         parts = load_diffusion_parts(network.name, network.subfolder, network.revision, network.autoencoder, self.dtype)
         self._scheduler = make_scheduler(network.scheduler, parts.scheduler_config, network.steps)
         self.scheduler = type(self._scheduler).__name__
-        self._unet, self._autoencoder = (
-            part.to(self.device, memory_format=torch.channels_last) for part in (parts.unet, parts.autoencoder)
-        )
+        cure = 'lower memory elsewhere, take a smaller crop, dtype="bf16" or "fp16", or a tiny autoencoder; fewer steps would not help'
+        self._unet, self._autoencoder = (part.to(memory_format=torch.channels_last) for part in (parts.unet, parts.autoencoder))
+        to_device((self._unet, self._autoencoder), self.device, "diffusion inpainting", cure)
         self._prompt = parts.prompt.to(self.device)
         if network.compile:
             mode = network.compile if isinstance(network.compile, str) else None
             for module in (self._unet, self._autoencoder.encoder, self._autoencoder.decoder):
                 module.compile(mode=mode)
-        cure = 'lower memory elsewhere, take a smaller crop, dtype="bf16" or "fp16", or a tiny autoencoder; fewer steps would not help'
         asked = 1 if network.micro_batch == "auto" else network.micro_batch
         self.micro_batch = MicroBatch("diffusion inpainting", asked, self.device, cure)
         self._to_be_found = network.micro_batch == "auto" and self.device.type != "cpu"
@@ -117,8 +132,12 @@ class DiffusionInpainter:
         made = self.micro_batch.run(lambda part: self._inpaint(right[part], inpaint_mask[part], noise[part]), len(right))
         return torch.cat([right.new_empty(0, *right.shape[1:]), *(part.to(right.device) for part in made)])
 
-    def warm_up(self, size: tuple[int, int]) -> WarmUp:
+    def warm_up(self, size: tuple[int, int], samples: int | None = None) -> WarmUp:
         """Runs the networks on empty images of this (height, width); finds the micro-batch where it is "auto"; says what memory it takes.
+
+        Args:
+            size: height and width of the images.
+            samples: the most that will come at once; None is not known. No micro-batch is larger.
 
         Raises:
             MemoryError: the device's memory does not suffice for one sample.
@@ -126,18 +145,20 @@ class DiffusionInpainter:
         seconds = 0.0
         if self._to_be_found:
             with torch.compiler.set_stance("force_eager"):  # it would compile for every size that is tried
-                self.micro_batch.size, seconds = self._find_micro_batch(size)
+                self.micro_batch.size, seconds = self._find_micro_batch(size, LARGEST_AUTO if samples is None else samples)
             self._to_be_found = False
+        if samples is not None:
+            parts = -(-samples // self.micro_batch.size)
+            self.micro_batch.size = -(-samples // parts)  # as many parts, of equal size
         peak, last = measure(
             lambda: self.micro_batch.run(lambda part: self._try(part.stop - part.start, size), self.micro_batch.size), self.device
         )
-        if peak is not None:
-            peak += weight_bytes(self._unet, self._autoencoder)
+        weights = weight_bytes(self._unet, self._autoencoder)
         what = f"inpainting {self.network.name} at {size[0]}x{size[1]}, {self.dtype}"
-        return WarmUp(what, self.micro_batch.size, peak, seconds + last)
+        return WarmUp(what, self.micro_batch.size, None if peak is None else peak + weights, weights, seconds + last)
 
-    def _find_micro_batch(self, size: tuple[int, int]) -> tuple[int, float]:
-        """The largest micro-batch within the budget, and the seconds that finding it took."""
+    def _find_micro_batch(self, size: tuple[int, int], most: int) -> tuple[int, float]:
+        """The largest micro-batch within the budget, at most `most`, and the seconds that finding it took."""
         weights = weight_bytes(self._unet, self._autoencoder)
         allowed = self.network.memory_gib
         budget = int(AUTO_SHARE * free_bytes(self.device)) if allowed is None else int(allowed * GIB) - weights
@@ -147,14 +168,16 @@ class DiffusionInpainter:
             nonlocal spent
             try:
                 peak, seconds = measure(lambda: self._try(samples, size), self.device)
-            except torch.OutOfMemoryError:
-                if samples == 1:
-                    return 0  # the warm-up that follows says it
-                return MANY
+            except RuntimeError as error:
+                if not out_of_memory(error):
+                    raise
+                return 0 if samples == 1 else MANY  # of one sample, the warm-up that follows says it
             spent += seconds
+            if samples == 1 and allowed is not None and peak is not None and peak > budget:
+                logger.warning("memory_gib=%g cannot be held: one sample and the weights take %.2f GiB", allowed, (weights + peak) / GIB)
             return peak or 0
 
-        return largest_micro_batch(peak_bytes, budget), spent
+        return largest_micro_batch(peak_bytes, budget, min(most, LARGEST_AUTO)), spent
 
     def _try(self, samples: int, size: tuple[int, int]) -> None:
         right = torch.zeros(samples, 3, *size, device=self.device)
@@ -163,7 +186,10 @@ class DiffusionInpainter:
 
     @torch.no_grad()
     def _inpaint(self, right: Tensor, inpaint_mask: Tensor, noise: Tensor, most_steps: int | None = None) -> Tensor:
-        height, width = right.shape[-2:]
+        count, (height, width) = len(right), right.shape[-2:]
+        if self.network.compile and count < self.micro_batch.size:  # compiled for one size: another would be compiled anew
+            rows = torch.arange(self.micro_batch.size).clamp(max=count - 1)
+            right, inpaint_mask, noise = right[rows], inpaint_mask[rows], noise[rows]
         generators = [torch.Generator().manual_seed(crc32(sample.numpy().tobytes())) for sample in noise.float().cpu()]
         right, inpaint_mask, noise = (tensor.to(self.device) for tensor in (right, inpaint_mask, noise.float()))
         # An autocast of the training loop around the loader must not change the pictures.
@@ -172,19 +198,30 @@ class DiffusionInpainter:
             masked = F.pad(masked, (0, -width % CELL_PX, 0, -height % CELL_PX), mode="replicate")
             latents = self._denoise(noise, latent_mask(inpaint_mask), self._encode(masked), generators, most_steps)
             decoded = self._decode(latents)
-        return (decoded[..., :height, :width].clamp(-1, 1) + 1) * 127.5
+        return (decoded[:count, :, :height, :width].clamp(-1, 1) + 1) * 127.5
 
     def _encode(self, images: Tensor) -> Tensor:
         """Images in -1..1 to latents: the mean of the encoder's distribution."""
-        made = [self._autoencoder.encode(part) for part in images.to(self.dtype).split(AUTOENCODER_BATCH)]
-        # A tiny autoencoder has no distribution.
-        latents = [encoded.latent_dist.mean if hasattr(encoded, "latent_dist") else encoded.latents for encoded in made]
+        latents = []
+        for part in images.to(self.dtype).split(AUTOENCODER_BATCH):
+            self._begin()
+            encoded = self._autoencoder.encode(part)
+            # A tiny autoencoder has no distribution.
+            latents.append((encoded.latent_dist.mean if hasattr(encoded, "latent_dist") else encoded.latents).clone())
         return torch.cat(latents) * self._autoencoder.config.scaling_factor
 
     def _decode(self, latents: Tensor) -> Tensor:
         """Latents to float32 images in about -1..1."""
-        latents = latents.to(self.dtype) / self._autoencoder.config.scaling_factor
-        return torch.cat([self._autoencoder.decode(part).sample.float() for part in latents.split(AUTOENCODER_BATCH)])
+        latents, images = latents.to(self.dtype) / self._autoencoder.config.scaling_factor, []
+        for part in latents.split(AUTOENCODER_BATCH):
+            self._begin()
+            images.append(self._autoencoder.decode(part).sample.to(torch.float32, copy=True))
+        return torch.cat(images)
+
+    def _begin(self) -> None:
+        """Before each call of a network: with CUDA graphs, what one returned is overwritten from here on, so all of it is copied."""
+        if self.network.compile:
+            torch.compiler.cudagraph_mark_step_begin()
 
     def _denoise(
         self, noise: Tensor, mask: Tensor, masked_latents: Tensor, generators: list[torch.Generator], most_steps: int | None
@@ -197,8 +234,7 @@ class DiffusionInpainter:
         timesteps = scheduler.timesteps[:most_steps]
         for timestep, timestep_on_device in zip(timesteps, timesteps.to(self.device), strict=True):
             noisy = torch.cat([scheduler.scale_model_input(latents, timestep).to(dtype), beside], dim=1)
-            if self.network.compile:
-                torch.compiler.cudagraph_mark_step_begin()  # what the graph returned before may be overwritten now
+            self._begin()
             predicted = self._unet(noisy, timestep_on_device, encoder_hidden_states=prompt).sample.to(torch.float32, copy=True)
             latents = scheduler.step(predicted, timestep, latents, **options).prev_sample
         return latents
