@@ -14,6 +14,7 @@ STAGES = ["stage1", "stage2", "stage3", "stage4"]
 NECK: dict[str, Any] = {"neck_hidden_sizes": [8, 16, 24, 32], "fusion_hidden_size": 16}
 VIT: dict[str, Any] = {"hidden_size": 32, "num_hidden_layers": 4, "num_attention_heads": 2}
 IMAGENET = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
+IMAGENET_GREY_LEVELS = {"do_rescale": False, "image_mean": [123.675, 116.28, 103.53], "image_std": [58.395, 57.12, 57.375]}
 
 
 def dinov2() -> Any:
@@ -106,7 +107,7 @@ NETWORKS: dict[str, tuple[Callable[[], Any], str, dict[str, Any]]] = {
     "midas_vit": (midas_vit, DPT, {"size": {"height": 64, "width": 64}, "resample": 2}),
     "midas_beit": (midas_beit, DPT, {"size": {"height": 64, "width": 64}, "keep_aspect_ratio": True, "ensure_multiple_of": 32}),
     "midas_swin": (midas_swin, DPT, {"size": {"height": 64, "width": 64}, "keep_aspect_ratio": True, "ensure_multiple_of": 32}),
-    "dinov2_dpt": (dinov2_dpt, DPT, {"do_resize": False, "do_pad": True, "size_divisor": 14, **IMAGENET}),
+    "dinov2_dpt": (dinov2_dpt, DPT, {"do_resize": False, "do_pad": True, "size_divisor": 14, **IMAGENET_GREY_LEVELS}),
     "glpn": (glpn, "GLPNImageProcessor", {"size_divisor": 32}),
     "zoe": (zoe, "ZoeDepthImageProcessor", {"size": {"height": 64, "width": 96}, "ensure_multiple_of": 32}),
 }

@@ -86,7 +86,8 @@ def test_the_result_is_that_of_transformers_own_processor_and_model(folders, kin
     depth = load_depth(path)
     pixels = processor(images=[image], return_tensors="pt")["pixel_values"].float()
     tensor = torch.from_numpy(image).permute(2, 0, 1)[None]
-    levels = (pixels - depth.preprocessing.normalise(depth.prepare(tensor))) * torch.tensor(depth.preprocessing.std).view(3, 1, 1) * 255
+    difference = pixels - depth.preprocessing.normalise(depth.prepare(tensor))
+    levels = difference * torch.tensor(depth.preprocessing.std).view(3, 1, 1) / depth.preprocessing.rescale
     assert levels.abs().max() < 1.001  # PIL rounds a few pixels to the neighbouring grey level; ZoeDepth's does not round
     assert levels.abs().mean() < (0.3 if kind == "zoe" else 0.01)
     with torch.no_grad():
@@ -110,6 +111,14 @@ def test_depth_pro_is_given_its_square_and_not_inverted(folders):
         predicted = network(pixel_values=F.interpolate(images, (56, 56), mode="bilinear") / 127.5 - 1).predicted_depth
     expected = F.interpolate(predicted[None], (90, 131), mode="bilinear")
     assert (load_depth(path)(images) - expected).abs().max() < 0.02 * (expected.max() - expected.min())
+
+
+@pytest.mark.parametrize(("options", "factor"), [({}, 1 / 255), ({"rescale_factor": 1 / 127.5}, 1 / 127.5), ({"do_rescale": False}, 1.0)])
+def test_grey_levels_are_rescaled_as_the_folder_says(copy, options, factor):
+    change(copy, "preprocessor_config.json", image_mean=[1.0, 2.0, 3.0], image_std=[0.5, 1.0, 2.0], **options)
+    made = load_preprocessing(DepthNetwork(str(copy))).normalise(torch.full((1, 3, 1, 1), 204, dtype=torch.uint8))
+    expected = [(204 * factor - mean) / std for mean, std in ((1.0, 0.5), (2.0, 1.0), (3.0, 2.0))]
+    assert torch.allclose(made.flatten(), torch.tensor(expected))
 
 
 def test_the_network_sees_what_its_folder_says(folder, monkeypatch):
@@ -288,7 +297,7 @@ def test_a_revision_is_found_in_the_hub_cache_without_network(folder, tmp_path):
         "from zsdata.synthesis.depth.options import DepthNetwork\n"
         'network = DepthNetwork("somebody/depth", "native", revision="v1")\n'
         "assert zsdata.load_depth(network)(torch.rand(1, 3, 28, 42) * 255).shape == (1, 1, 28, 42)\n"
-        f'assert depth_identity(network) == "hub somebody/depth {"0" * 40} 2 resolution=native"\n'
+        f'assert depth_identity(network) == "hub somebody/depth {"0" * 40} 3 resolution=native"\n'
         "try:\n"
         '    zsdata.load_depth("somebody/depth")\n'
         "except OSError as error:\n"

@@ -13,7 +13,7 @@ from huggingface_hub import try_to_load_from_cache
 from zsdata.synthesis.depth.options import DepthNetwork
 
 BUILTIN_VERSION = 1  # raised when the built-in estimator's output changes
-PRETRAINED_VERSION = 2  # raised when pretrained.py does something else before or after the network
+PRETRAINED_VERSION = 3  # raised when pretrained.py does something else before or after the network
 
 CONFIG_NAMES = ("config.json", "preprocessor_config.json")
 WEIGHT_MARKS = (".safetensors", ".bin")  # part of the name of a file of weights, or of its index

@@ -45,7 +45,8 @@ class Preprocessing:
         short_side_px: of the network's input; None is the photo's own.
         multiple_px: both sides are multiples of it.
         square: the network takes squares alone; the aspect is not kept.
-        mean, std: of the channels, for values in 0..1.
+        rescale: what grey levels 0..255 are multiplied by before they are normalised.
+        mean, std: of the channels, for values that are rescaled.
         mode: how photos are resized: "bilinear" or "bicubic".
         antialias: whether a photo that shrinks is smoothed; without it corners are aligned, where `reflect` is set.
         reflect: whether the photo is continued at its edges by reflection first, and the prediction cut to the photo again.
@@ -54,6 +55,7 @@ class Preprocessing:
     short_side_px: int | None
     multiple_px: int
     square: bool
+    rescale: float
     mean: tuple[float, ...]
     std: tuple[float, ...]
     mode: str
@@ -87,9 +89,9 @@ class Preprocessing:
         return resized.round_().clamp_(0, 255).to(torch.uint8)
 
     def normalise(self, inputs: Tensor) -> Tensor:
-        """uint8 [B, 3, h, w] to float32, by the channels' means and deviations."""
+        """uint8 [B, 3, h, w] to float32: rescaled, then by the channels' means and deviations."""
         mean, std = (torch.tensor(values, device=inputs.device).view(1, 3, 1, 1) for values in (self.mean, self.std))
-        return (inputs.float() / 255 - mean) / std
+        return (inputs.float() * self.rescale - mean) / std
 
     def restore(self, predicted: Tensor, size: tuple[int, int]) -> Tensor:
         """A prediction [B, 1, h, w] of any size to the photos' size, without what was added at their edges."""
@@ -142,6 +144,7 @@ def read_preprocessing(name: str, folder: Mapping[str, Any], config: Any, resolu
         short_side_px=short_side_px,
         multiple_px=_multiple_px(told, config),
         square=square,
+        rescale=float(told.get("rescale_factor", 1 / 255)) if told.get("do_rescale", True) else 1.0,
         mean=tuple(told["image_mean"]) if normalised else (0.0, 0.0, 0.0),
         std=tuple(told["image_std"]) if normalised else (1.0, 1.0, 1.0),
         mode=RESAMPLING[told["resample"]],
