@@ -57,10 +57,11 @@ def change(folder, name, **values):
     path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
 
 
+@pytest.mark.parametrize("dtype", ["float32", "bf16"])
 @pytest.mark.parametrize("kind", small.NETWORKS)
-def test_every_kind_of_network_gives_a_finite_map_of_the_photos_size(folders, kind):
+def test_every_kind_of_network_gives_a_finite_map_of_the_photos_size(folders, kind, dtype):
     images = photos(2)
-    depth = load_depth(folders(kind))(images)
+    depth = load_depth(folders(kind), dtype=dtype)(images)
     assert depth.shape == (2, 1, 90, 131) and depth.dtype == torch.float32
     assert torch.isfinite(depth).all() and depth.std() > 0 and not torch.equal(depth[0], depth[1])
 

@@ -201,9 +201,9 @@ def _keep_in_float32(layers: torch.nn.Module, device_type: str) -> None:
     """Lets no autocast into these layers. What they return is depth: bfloat16 would leave 256 steps of it between 1 and 2."""
     forward = layers.forward
 
-    def in_float32(*inputs: Any) -> Any:
+    def in_float32(*inputs: Any, **named: Any) -> Any:
         with torch.autocast(device_type, enabled=False):
-            return forward(*(_to_float32(value) for value in inputs))
+            return forward(*_to_float32(inputs), **{name: _to_float32(value) for name, value in named.items()})
 
     layers.forward = in_float32
 
