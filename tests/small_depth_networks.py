@@ -98,6 +98,13 @@ def depth_pro() -> Any:
     return hf.DepthProForDepthEstimation(config)
 
 
+def tipsv2() -> Any:
+    backbone = hf.Tipsv2VisionConfig(
+        **VIT, mlp_ratio=2, image_size=70, patch_size=14, out_indices=[1, 2, 3, 4], reshape_hidden_states=False
+    )
+    return hf.Tipsv2DptForDepthEstimation(hf.Tipsv2DptConfig(backbone_config=backbone, **NECK))
+
+
 DPT, SQUARE_70 = "DPTImageProcessor", {"height": 70, "width": 70}
 PATCHES = {"keep_aspect_ratio": True, "ensure_multiple_of": 14}
 # Each network, its image processor and the options of that, as in the published folders but for the sizes.
@@ -113,6 +120,8 @@ NETWORKS: dict[str, tuple[Callable[[], Any], str, dict[str, Any]]] = {
 }
 if hasattr(hf, "DepthProConfig"):  # since transformers 4.49
     NETWORKS["depth_pro"] = (depth_pro, "DepthProImageProcessor", {"size": {"height": 56, "width": 56}})
+if hasattr(hf, "Tipsv2DptConfig"):
+    NETWORKS["tipsv2"] = (tipsv2, "Tipsv2DptImageProcessor", {"size": SQUARE_70, "resample": 2, "do_normalize": False})
 
 
 def save_small_network(kind: str, folder: Path, seed: int = 0) -> Path:

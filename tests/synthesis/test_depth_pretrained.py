@@ -253,6 +253,15 @@ def test_half_precision_keeps_fine_steps(folder):
     assert len(coarse.unique()) < 1000 < len(steps.unique())
 
 
+@pytest.mark.parametrize("kind", small.NETWORKS)
+def test_half_precision_keeps_as_many_values_as_float32_in_every_kind_of_network(folders, kind):
+    exact, half = (load_depth(folders(kind), dtype=dtype) for dtype in ("float32", "bf16"))
+    inputs = exact.prepare(photos(1))
+    size = tuple(inputs.shape[-2:])
+    exact_values, half_values = (len(depth.predict([inputs], [size])[0].unique()) for depth in (exact, half))
+    assert half_values > 0.9 * exact_values
+
+
 def test_an_autocast_around_it_changes_nothing(folder):
     depth = load_depth(folder)
     with torch.autocast("cpu", torch.bfloat16):

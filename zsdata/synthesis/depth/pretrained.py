@@ -27,7 +27,8 @@ METRIC_DPT_BACKBONES = ("dinov2", "dinov2_with_registers")  # DPT heads on DINOv
 
 SMALLEST_DEPTH_M = 1e-3
 HUB_ID = re.compile(r"[\w.-]+(/[\w.-]+)?")
-LAST_LAYERS = ("head", "relative_head", "metric_head")  # names that transformers' depth networks give them
+# What makes depth of features, by the names that transformers' depth networks give it.
+LAST_LAYERS = ("head", "relative_head", "metric_head", "features_to_depth", "decoder.head", "bin_regressor")
 # DPT networks have these weights, published checkpoints do not, and nothing uses them: the first stage fuses nothing.
 NEVER_USED = re.compile(r"fusion_stage\.layers\.0\.residual_layer1\.")
 
@@ -50,24 +51,25 @@ class PretrainedDepth:
     """
 
     def __init__(self, network: DepthNetwork, device: str | torch.device = "cpu") -> None:
-        name = network.name
         self.network, self.device = network, torch.device(device)
         self.dtype = choose_dtype(network.dtype, self.device)
         self.preprocessing = load_preprocessing(network)
         from transformers import AutoModelForDepthEstimation
 
         with torch.random.fork_rng(devices=[]):  # older transformers fill the weights with random numbers first
-            loaded, report = AutoModelForDepthEstimation.from_pretrained(name, revision=network.revision, output_loading_info=True)
+            loaded, report = AutoModelForDepthEstimation.from_pretrained(network.name, revision=network.revision, output_loading_info=True)
         missing = sorted(key for key in report["missing_keys"] if not NEVER_USED.search(key))
         if missing:
-            raise ValueError(f'depth="{name}" lacks {len(missing)} weights, "{missing[0]}" for one; download it again')
-        self._predicts_depth = (network.predicts or _predicts(name, loaded.config)) == "depth"
+            raise ValueError(f'depth="{network.name}" lacks {len(missing)} weights, "{missing[0]}" for one; download it again')
+        self._predicts_depth = (network.predicts or _predicts(network.name, loaded.config)) == "depth"
         self._network: Any = loaded.to(self.device, torch.float32).eval().requires_grad_(False)  # saved in half precision or not
         if self.device.type == "cuda":
             self._network.to(memory_format=torch.channels_last)
         if self.dtype != torch.float32:
-            for layers in filter(None, (getattr(loaded, attribute, None) for attribute in LAST_LAYERS)):
-                _keep_in_float32(layers, self.device.type)
+            layers = dict(loaded.named_modules())
+            for name in LAST_LAYERS:
+                if name in layers:
+                    _keep_in_float32(layers[name], self.device.type)
         if network.compile:
             self._network.compile()
         self.micro_batch = MicroBatch(
