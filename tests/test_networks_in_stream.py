@@ -104,9 +104,10 @@ def test_auto_keeps_depth_in_the_workers_where_the_loader_has_no_gpu(folder, tar
 
 def test_options_that_change_no_picture_do_not_change_the_place(folder, tar):
     state = ZeroStereoStream(tar, size=SIZE, depth=DepthNetwork(str(folder), micro_batch=2)).state_dict()
-    ZeroStereoStream(tar, size=SIZE, depth=DepthNetwork(str(folder), micro_batch=16)).load_state_dict(state)
-    with pytest.raises(ValueError, match="configuration"):
-        ZeroStereoStream(tar, size=SIZE, depth=DepthNetwork(str(folder), resolution=42)).load_state_dict(state)
+    ZeroStereoStream(tar, size=SIZE, depth=DepthNetwork(str(folder), dtype="float32", micro_batch=16)).load_state_dict(state)
+    for changed in ({"resolution": 42}, {"dtype": "bf16"}):
+        with pytest.raises(ValueError, match="configuration"):
+            ZeroStereoStream(tar, size=SIZE, depth=DepthNetwork(str(folder), **changed)).load_state_dict(state)
 
 
 def test_provenance_names_the_models_with_their_licences(folder, tar):

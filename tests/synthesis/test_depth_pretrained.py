@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import types
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from safetensors.torch import load_file, save_file
 
 from tests.scenes import grey_fill, photo, photo_tar
 from zsdata import ZeroStereoStream, load_depth
+from zsdata.synthesis.depth import pretrained
 from zsdata.synthesis.depth.identity import depth_identity
 from zsdata.synthesis.depth.options import DepthNetwork
 from zsdata.synthesis.depth.pretrained import SMALLEST_DEPTH_M, _predicts, load_preprocessing
@@ -323,7 +325,22 @@ def test_a_revision_is_found_in_the_hub_cache_without_network(folder, tmp_path):
 def test_the_cache_tells_options_apart(folder):
     plain, native, half = (depth_identity(DepthNetwork(str(folder), **o)) for o in ({}, {"resolution": "native"}, {"dtype": "bf16"}))
     assert plain == depth_identity(folder) and len({plain, native, half}) == 3
-    assert depth_identity(DepthNetwork(str(folder), compile=True, micro_batch=2)) == plain
+    assert depth_identity(DepthNetwork(str(folder), dtype="float32", compile=True, micro_batch=2)) == plain
+
+
+def test_a_network_computes_in_whole_float32_unless_another_format_is_asked_for(folder, monkeypatch):
+    """Wherever it runs: labels from a GPU are those from the workers and of `replay`."""
+    kept_whole, networks = [], [load_depth(folder), load_depth(folder, dtype="bf16")]
+
+    @contextmanager
+    def recorded(device):
+        kept_whole.append(device)
+        yield
+
+    monkeypatch.setattr(pretrained, "without_tf32", recorded)
+    for depth in networks:
+        depth(photos(1))
+    assert [depth.dtype for depth in networks] == [torch.float32, torch.bfloat16] and kept_whole == [torch.device("cpu")]
 
 
 def test_what_is_predicted_is_told_by_the_configuration_or_by_the_user(folder):

@@ -41,7 +41,11 @@ def depth_identity(depth: str | os.PathLike[str] | DepthNetwork | Callable[..., 
         ValueError: a callable without `cache_name`, or a string that is neither a folder nor a Hub id.
     """
     if isinstance(depth, DepthNetwork):
-        options = {"resolution": depth.resolution, "predicts": depth.predicts, "dtype": depth.dtype}
+        options = {
+            "resolution": depth.resolution,
+            "predicts": depth.predicts,
+            "dtype": None if depth.dtype == DepthNetwork.dtype else depth.dtype,
+        }
         said = "".join(f" {option}={value}" for option, value in options.items() if value is not None)
         return f"{_name_identity(depth.name, depth.revision)}{said}"
     if callable(depth):

@@ -10,6 +10,7 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -18,7 +19,7 @@ from torch import Tensor
 from zsdata.synthesis.depth.options import DepthNetwork
 from zsdata.synthesis.depth.preprocessing import Preprocessing, read_preprocessing
 from zsdata.synthesis.micro_batch import MicroBatch, WarmUp, measure, weight_bytes
-from zsdata.synthesis.precision import choose_dtype
+from zsdata.synthesis.precision import DTYPES, without_tf32
 
 # What a network's prediction is, by the model_type of its configuration. Depth Pro's is inverse depth: transformers inverts it afterwards.
 INVERSE_DEPTH_MODELS = ("depth_pro",)
@@ -52,7 +53,7 @@ class PretrainedDepth:
 
     def __init__(self, network: DepthNetwork, device: str | torch.device = "cpu") -> None:
         self.network, self.device = network, torch.device(device)
-        self.dtype = choose_dtype(network.dtype, self.device)
+        self.dtype = DTYPES[network.dtype]
         self.preprocessing = load_preprocessing(network)
         from transformers import AutoModelForDepthEstimation
 
@@ -152,7 +153,8 @@ class PretrainedDepth:
 
     def _run(self, inputs: Tensor) -> Tensor:
         """uint8 [B, 3, h, w] on the device to inverse depth, float32 [B, 1, h', w']."""
-        with torch.autocast(self.device.type, self.dtype, enabled=self.dtype != torch.float32):
+        whole = self.dtype == torch.float32
+        with without_tf32(self.device) if whole else nullcontext(), torch.autocast(self.device.type, self.dtype, enabled=not whole):
             predicted = self._network(pixel_values=self.preprocessing.normalise(inputs)).predicted_depth.unsqueeze(1).float()
         return 1 / predicted.clamp(min=SMALLEST_DEPTH_M) if self._predicts_depth else predicted
 
