@@ -105,6 +105,33 @@ def tipsv2() -> Any:
     return hf.Tipsv2DptForDepthEstimation(hf.Tipsv2DptConfig(backbone_config=backbone, **NECK))
 
 
+def chmv2() -> Any:
+    backbone = hf.DINOv3ViTConfig(
+        **VIT,
+        intermediate_size=64,
+        image_size=64,
+        patch_size=16,
+        out_indices=[1, 2, 3, 4],
+        reshape_hidden_states=True,
+        return_class_token=True,
+        apply_layernorm=True,
+    )
+    head = {
+        "post_process_channels": NECK["neck_hidden_sizes"],
+        "fusion_hidden_size": 16,
+        "head_hidden_size": 8,
+        "number_output_channels": 32,
+    }
+    return hf.CHMv2ForDepthEstimation(hf.CHMv2Config(backbone_config=backbone, **head))
+
+
+def prompt_depth_anything() -> Any:
+    config = hf.PromptDepthAnythingConfig(
+        backbone_config=dinov2(), reassemble_hidden_size=32, **NECK, head_hidden_size=8, depth_estimation_type="metric", max_depth=20
+    )
+    return hf.PromptDepthAnythingForDepthEstimation(config)
+
+
 DPT, SQUARE_70 = "DPTImageProcessor", {"height": 70, "width": 70}
 PATCHES = {"keep_aspect_ratio": True, "ensure_multiple_of": 14}
 # Each network, its image processor and the options of that, as in the published folders but for the sizes.
@@ -122,6 +149,10 @@ if hasattr(hf, "DepthProConfig"):  # since transformers 4.49
     NETWORKS["depth_pro"] = (depth_pro, "DepthProImageProcessor", {"size": {"height": 56, "width": 56}})
 if hasattr(hf, "Tipsv2DptConfig"):
     NETWORKS["tipsv2"] = (tipsv2, "Tipsv2DptImageProcessor", {"size": SQUARE_70, "resample": 2, "do_normalize": False})
+if hasattr(hf, "CHMv2Config"):
+    NETWORKS["chmv2"] = (chmv2, "CHMv2ImageProcessor", {})
+if hasattr(hf, "PromptDepthAnythingConfig"):  # since transformers 4.50
+    NETWORKS["prompt_depth_anything"] = (prompt_depth_anything, "PromptDepthAnythingImageProcessor", {"size": SQUARE_70, **PATCHES})
 
 
 def save_small_network(kind: str, folder: Path, seed: int = 0) -> Path:

@@ -27,6 +27,7 @@ transformers = pytest.importorskip("transformers")
 small = pytest.importorskip("tests.small_depth_networks")
 
 PREDICT_DEPTH = {"metric_depth_anything", "dinov2_dpt", "glpn", "zoe"}
+HALVES = ((0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
 PIL_PROCESSORS = {"DPTImageProcessor", "GLPNImageProcessor", "ZoeDepthImageProcessor"}  # the others need torchvision
 
 
@@ -114,6 +115,18 @@ def test_depth_pro_is_given_its_square_and_not_inverted(folders):
         predicted = network(pixel_values=F.interpolate(images, (56, 56), mode="bilinear") / 127.5 - 1).predicted_depth
     expected = F.interpolate(predicted[None], (90, 131), mode="bilinear")
     assert (load_depth(path)(images) - expected).abs().max() < 0.02 * (expected.max() - expected.min())
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "mean", "std"),
+    [("chmv2", (96, 128), (0.42, 0.411, 0.296), (0.213, 0.156, 0.143)), ("prompt_depth_anything", (70, 98), *HALVES)],
+)
+def test_newer_networks_see_what_their_image_processors_do_by_default(folders, kind, size, mean, std):
+    if kind not in small.NETWORKS:
+        pytest.skip("needs a newer transformers")
+    preprocessing = load_preprocessing(DepthNetwork(str(folders(kind))))
+    assert preprocessing.input_size(90, 131) == size
+    assert (preprocessing.mean, preprocessing.std, preprocessing.mode) == (mean, std, "bicubic")
 
 
 @pytest.mark.parametrize(("options", "factor"), [({}, 1 / 255), ({"rescale_factor": 1 / 127.5}, 1 / 127.5), ({"do_rescale": False}, 1.0)])
@@ -353,6 +366,27 @@ def test_what_is_predicted_is_told_by_the_configuration_or_by_the_user(folder):
     assert torch.allclose(deep, 1 / near.clamp(min=SMALLEST_DEPTH_M))
 
 
+@pytest.mark.parametrize(
+    ("kind", "predicts"),
+    [
+        ("depth_anything", "inverse depth"),
+        ("metric_depth_anything", "depth"),
+        ("midas_vit", "inverse depth"),
+        ("dinov2_dpt", "depth"),
+        ("glpn", "depth"),
+        ("zoe", "depth"),
+        ("depth_pro", "inverse depth"),
+        ("tipsv2", "depth"),
+        ("chmv2", "inverse depth"),  # the height of trees from above
+        ("prompt_depth_anything", "depth"),
+    ],
+)
+def test_what_each_kind_of_network_predicts_is_known(folders, kind, predicts):
+    if kind not in small.NETWORKS:
+        pytest.skip("needs a newer transformers")
+    assert torch.equal(load_depth(folders(kind))(photos(1)), load_depth(folders(kind), predicts=predicts)(photos(1)))
+
+
 def test_missing_weights_are_named(copy):
     path = copy / "model.safetensors"
     weights = load_file(path)
@@ -382,7 +416,7 @@ def test_weights_that_nothing_uses_may_be_missing(copy):
 
 def test_an_unknown_image_processor_is_named(copy):
     change(copy, "preprocessor_config.json", image_processor_type="NewImageProcessor")
-    with pytest.raises(ValueError, match="wants its photos prepared by NewImageProcessor; known are those of DPT, DepthPro"):
+    with pytest.raises(ValueError, match="wants its photos prepared by NewImageProcessor; known are those of CHMv2, DPT, DepthPro"):
         load_depth(copy)
     change(copy, "preprocessor_config.json", image_processor_type="DPTImageProcessor", resample=1)
     with pytest.raises(ValueError, match="resizes photos by method 1"):

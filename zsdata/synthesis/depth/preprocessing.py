@@ -19,9 +19,17 @@ from torch import Tensor
 HALF = (0.5, 0.5, 0.5)
 # What transformers' image processors do unless the folder says otherwise, by the name of their class without its ending.
 CLASS_DEFAULTS: dict[str, dict[str, Any]] = {
+    "CHMv2": {
+        "do_resize": False,
+        "size_divisor": 16,
+        "resample": 3,
+        "image_mean": (0.42, 0.411, 0.296),
+        "image_std": (0.213, 0.156, 0.143),
+    },
     "DPT": {"size": 384, "resample": 3, "image_mean": HALF, "image_std": HALF},
     "DepthPro": {"size": 1536, "resample": 2, "image_mean": HALF, "image_std": HALF, "antialias": False},
     "GLPN": {"do_normalize": False, "resample": 2, "size_divisor": 32},
+    "PromptDepthAnything": {"size": 384, "resample": 3, "image_mean": HALF, "image_std": HALF},
     "Tipsv2Dpt": {"do_normalize": False, "size": 448, "resample": 2},
     "ZoeDepth": {
         "size": {"height": 384, "width": 512},

@@ -21,8 +21,9 @@ from zsdata.synthesis.depth.preprocessing import Preprocessing, read_preprocessi
 from zsdata.synthesis.micro_batch import MicroBatch, WarmUp, measure, weight_bytes
 from zsdata.synthesis.precision import DTYPES, without_tf32
 
-# What a network's prediction is, by the model_type of its configuration. Depth Pro's is inverse depth: transformers inverts it afterwards.
-INVERSE_DEPTH_MODELS = ("depth_pro",)
+# What a network's prediction is, by the model_type of its configuration, which may say "metric" besides. Depth Pro's is inverse depth:
+# transformers inverts it afterwards. CHMv2's is the height of trees seen from above: what is higher is nearer, as inverse depth has it.
+INVERSE_DEPTH_MODELS = ("chmv2", "depth_anything", "depth_pro", "prompt_depth_anything")
 DEPTH_MODELS = ("glpn", "tipsv2_dpt", "zoedepth")
 METRIC_DPT_BACKBONES = ("dinov2", "dinov2_with_registers")  # DPT heads on DINOv2 predict metres (NYU, KITTI); MiDaS's predict inverse depth
 
@@ -193,7 +194,7 @@ def _predicts(name: str, config: Any) -> str:
     if kind == "dpt":
         backbone = getattr(getattr(config, "backbone_config", None), "model_type", None)
         return "depth" if backbone in METRIC_DPT_BACKBONES else "inverse depth"
-    if kind == "depth_anything" or kind in INVERSE_DEPTH_MODELS:
+    if kind in INVERSE_DEPTH_MODELS:
         return "inverse depth"
     raise ValueError(
         f'depth="{name}" is a {kind} network, of which it is not known whether it predicts depth or inverse depth; say so: '
