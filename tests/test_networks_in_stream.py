@@ -6,8 +6,8 @@ import sys
 import pytest
 import torch
 
-from tests.scenes import grey_fill, layered_depth, photo_tar
-from zsdata import ZeroStereoStream
+from tests.scenes import grey_fill, layered_depth, photo, photo_tar, png, write_tar
+from zsdata import QualityGate, ZeroStereoStream, load_depth
 from zsdata.licences import NonCommercialModel
 from zsdata.synthesis.depth import DepthNetwork
 from zsdata.synthesis.inpaint import DiffusionNetwork
@@ -15,6 +15,7 @@ from zsdata.synthesis.inpaint import DiffusionNetwork
 small = pytest.importorskip("tests.small_depth_networks")
 
 SIZE = (64, 96)
+ALL_PASS = QualityGate(max_hole_share=1, min_visible_share=0, min_depth_range=0, min_flip_consistency=0)
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +56,24 @@ def test_the_resolution_reaches_the_network(folder, tar):
     assert torch.equal(next(iter(whole)).disparity, coarse.disparity)
     with pytest.raises(ValueError, match="depth_resolution belongs to a network"):
         ZeroStereoStream(tar, depth=layered_depth, depth_resolution=42)
+
+
+@pytest.mark.parametrize("placement", ["worker", "device"])
+@pytest.mark.parametrize("loaded", [False, True])
+def test_a_strip_is_counted_before_a_network_sees_it(folder, tmp_path, placement, loaded):
+    sizes = [(64, 256), (64, 257), (400, 64), (64, 64)]
+    tar = write_tar(tmp_path / "strips.tar", {f"{i}.png": png(photo(i, *size)) for i, size in enumerate(sizes)})
+    depth = load_depth(folder) if loaded else folder
+    with ZeroStereoStream(tar, size=SIZE, depth=depth, inpaint=grey_fill, depth_placement=placement).loader(1, num_workers=1) as loader:
+        used = {sample["key"] for batch in loader for sample in batch.meta}
+        assert used == {"0", "3"}
+        assert loader.stats()["rejected"] == {"too long for the depth network": 2}
+
+
+def test_a_network_that_takes_squares_sees_strips(tmp_path):
+    square = small.save_small_network("midas_vit", tmp_path / "midas_vit")
+    tar = write_tar(tmp_path / "strip.tar", {"strip.png": png(photo(0, 64, 400))})
+    assert len(list(ZeroStereoStream(tar, size=SIZE, depth=square, inpaint=grey_fill, quality=ALL_PASS))) == 1
 
 
 def test_a_network_that_is_nowhere_is_an_error_at_once_and_in_words(tar, tmp_path):

@@ -42,6 +42,7 @@ CLASS_DEFAULTS: dict[str, dict[str, Any]] = {
 }
 RESAMPLING = {2: "bilinear", 3: "bicubic"}  # by the number that PIL gives it
 HIERARCHICAL_MULTIPLE_PX = 32  # networks that halve their features five times, such as Swin and GLPN
+MOST_ASPECT = 4  # of the long side to the short one: the pixels of the network's input grow with it, and memory and time faster
 REFLECTED_SHARE = 3  # ZoeDepth reflects 3 sqrt(side / 2) pixels at each edge
 
 
@@ -79,6 +80,16 @@ class Preprocessing:
         height, width = height + 2 * rows, width + 2 * columns
         scale = 1.0 if self.short_side_px is None else self.short_side_px / min(height, width)
         return tuple(max(1, round(side * scale / self.multiple_px)) * self.multiple_px for side in (height, width))  # pyright: ignore
+
+    def refuses(self, height: int, width: int) -> str | None:
+        """Why a photo of this size is not shown to the network, as `BadPhoto` takes it, or None.
+
+        A strip is refused: 2048x64 pixels would become 16576x518, which takes minutes and tens of gigabytes, for pairs such as the quality
+        gate refuses. A network that takes squares is shown every photo.
+        """
+        if self.square or max(height, width) <= MOST_ASPECT * min(height, width):
+            return None
+        return f"too long for the depth network: one side more than {MOST_ASPECT} times the other: {width}x{height}"
 
     def prepare(self, images: Tensor) -> Tensor:
         """Photos [B, 3, H, W] 0..255, uint8 or float (rounded first), to the network's input before normalisation: uint8 [B, 3, h, w]."""
