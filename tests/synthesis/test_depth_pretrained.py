@@ -18,6 +18,7 @@ from safetensors.torch import load_file, save_file
 
 from tests.scenes import grey_fill, photo, photo_tar
 from zsdata import ZeroStereoStream, load_depth
+from zsdata.synthesis.confidence import normalize_inverse_depth
 from zsdata.synthesis.depth import pretrained
 from zsdata.synthesis.depth.identity import depth_identity
 from zsdata.synthesis.depth.options import DepthNetwork
@@ -60,6 +61,12 @@ def change(folder, name, **values):
     path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
 
 
+def inverted(metres):
+    """1 / depth, where the nearest thousandth of the pixels is no nearer than the next one."""
+    sorted_metres = metres.flatten().sort().values
+    return 1 / metres.clamp(min=max(SMALLEST_DEPTH_M, float(sorted_metres[math.ceil(len(sorted_metres) / 1000)])))
+
+
 @pytest.mark.parametrize("dtype", ["float32", "bf16"])
 @pytest.mark.parametrize("kind", small.NETWORKS)
 def test_every_kind_of_network_gives_a_finite_map_of_the_photos_size(folders, kind, dtype):
@@ -96,7 +103,7 @@ def test_the_result_is_that_of_transformers_own_processor_and_model(folders, kin
     assert levels.abs().mean() < (0.3 if kind == "zoe" else 0.01)
     with torch.no_grad():
         predicted = network(pixel_values=pixels).predicted_depth
-    inverse = 1 / predicted.clamp(min=SMALLEST_DEPTH_M) if kind in PREDICT_DEPTH else predicted
+    inverse = inverted(predicted) if kind in PREDICT_DEPTH else predicted
     rows, columns = (int(math.sqrt(side / 2) * 3) if kind == "zoe" else 0 for side in (height, width))
     expected = F.interpolate(inverse[None], (height + 2 * rows, width + 2 * columns), mode="bilinear")
     expected = expected[..., rows : rows + height, columns : columns + width]
@@ -363,7 +370,19 @@ def test_what_is_predicted_is_told_by_the_configuration_or_by_the_user(folder):
     images = photos(1, 70, 98)
     near, deep = (load_depth(folder, predicts=said)(images) for said in ("inverse depth", "depth"))
     assert torch.equal(near, load_depth(folder)(images))
-    assert torch.allclose(deep, 1 / near.clamp(min=SMALLEST_DEPTH_M))
+    assert torch.allclose(deep, inverted(near))
+
+
+def test_one_pixel_at_no_distance_changes_nothing_else(folder):
+    depth, metres = load_depth(folder, predicts="depth"), torch.linspace(1, 10, 96 * 128).view(1, 96, 128)
+    spoilt = metres.clone()
+    spoilt[0, 50, 60] = 0
+    made = []
+    for seen in (metres, spoilt):
+        depth._network = lambda pixel_values, seen=seen: types.SimpleNamespace(predicted_depth=seen)
+        made.append(normalize_inverse_depth(depth(torch.zeros(1, 3, 96, 128))))
+    different = (made[0] - made[1]).abs() > 0.002
+    assert different.nonzero().tolist() == [[0, 0, 50, 60]] and made[1][0, 0, 50, 60] == 1
 
 
 @pytest.mark.parametrize(

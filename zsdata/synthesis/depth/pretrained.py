@@ -6,6 +6,7 @@ The work has two halves that may run in two places: `prepare` resizes a photo on
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 from collections import defaultdict
@@ -28,6 +29,7 @@ DEPTH_MODELS = ("glpn", "tipsv2_dpt", "zoedepth")
 METRIC_DPT_BACKBONES = ("dinov2", "dinov2_with_registers")  # DPT heads on DINOv2 predict metres (NYU, KITTI); MiDaS's predict inverse depth
 
 SMALLEST_DEPTH_M = 1e-3
+NEAREST_SHARE = 0.001  # of a photo's pixels may be nearer than the depth that is taken for its nearest point
 HUB_ID = re.compile(r"[\w.-]+(/[\w.-]+)?")
 # What makes depth of features, by the names that transformers' depth networks give it.
 LAST_LAYERS = ("head", "relative_head", "metric_head", "features_to_depth", "decoder.head", "bin_regressor")
@@ -39,8 +41,9 @@ class PretrainedDepth:
     """A depth-estimation network of transformers, with the pre-processing that its folder states.
 
     Photos are resized so that their short side has the network's own length (or the one asked for), keeping the aspect, to whole patches;
-    normalised; and the prediction is brought back to the photo's size. Depth is inverted. On the CPU a photo's result is the same bit for
-    bit whatever it is estimated with; on a GPU up to rounding.
+    normalised; and the prediction is brought back to the photo's size. Depth is inverted, after its nearest thousandth was set to one
+    depth: a single pixel at 0 m would leave the rest of the photo flat. On the CPU a photo's result is the same bit for bit whatever it is
+    estimated with; on a GPU up to rounding.
 
     Args:
         network: which one, and how it is run.
@@ -157,7 +160,14 @@ class PretrainedDepth:
         whole = self.dtype == torch.float32
         with without_tf32(self.device) if whole else nullcontext(), torch.autocast(self.device.type, self.dtype, enabled=not whole):
             predicted = self._network(pixel_values=self.preprocessing.normalise(inputs)).predicted_depth.unsqueeze(1).float()
-        return 1 / predicted.clamp(min=SMALLEST_DEPTH_M) if self._predicts_depth else predicted
+        return _inverted(predicted) if self._predicts_depth else predicted
+
+
+def _inverted(depth: Tensor) -> Tensor:
+    """Depth [B, 1, h, w] to inverse depth; nothing is nearer than the depth that NEAREST_SHARE of its pixels, at least one, lie below."""
+    pixels = depth.flatten(1)
+    nearest = pixels.kthvalue(1 + math.ceil(NEAREST_SHARE * pixels.shape[1]), 1).values.clamp(min=SMALLEST_DEPTH_M)
+    return 1 / depth.maximum(nearest.view(-1, 1, 1, 1))
 
 
 def load_preprocessing(network: DepthNetwork) -> Preprocessing:
