@@ -27,7 +27,7 @@ from zsdata.quality import QualityGate
 from zsdata.sample import StereoBatch
 from zsdata.source.shard_cache import ShardCache
 from zsdata.sources import Schedule
-from zsdata.synthesis.depth import DepthEstimator, DepthNetwork, as_network, load_depth
+from zsdata.synthesis.depth import DepthEstimator, DepthNetwork, as_network, depth_name, load_depth
 from zsdata.synthesis.depth.builtin import warn_once
 from zsdata.synthesis.depth.cache import DepthCache
 from zsdata.synthesis.depth.identity import depth_identity, pinned
@@ -134,7 +134,7 @@ class ZeroStereoStream(IterableDataset):
         self._depth_placement = depth_placement
         self._views_per_image = views_per_image
         self._samples_per_photo = views_per_image * reuse
-        depth = depth if callable(depth) or isinstance(depth, DepthNetwork) else os.fspath(depth)
+        depth = depth if callable(depth) or isinstance(depth, DepthNetwork) else depth_name(depth)
         self._schedule = Schedule(sources, seed, epoch_size, self._samples_per_photo, stored_depth=depth == STORED)
         self._revision = 0
         self._told_problems = 0

@@ -3,6 +3,7 @@ import logging
 import math
 import os
 import pickle
+import re
 import shutil
 import subprocess
 import sys
@@ -404,6 +405,93 @@ def test_what_each_kind_of_network_predicts_is_known(folders, kind, predicts):
     if kind not in small.NETWORKS:
         pytest.skip("needs a newer transformers")
     assert torch.equal(load_depth(folders(kind))(photos(1)), load_depth(folders(kind), predicts=predicts)(photos(1)))
+
+
+def of_another_class(folder):
+    config = transformers.ViTConfig(hidden_size=8, num_hidden_layers=1, num_attention_heads=1, intermediate_size=8, image_size=16)
+    transformers.ViTForImageClassification(config).save_pretrained(folder)
+
+
+def in_two_files(folder):
+    weights = load_file(folder / "model.safetensors")
+    (folder / "model.safetensors").unlink()
+    save_file(weights, folder / "model-00001-of-00002.safetensors", metadata={"format": "pt"})
+    parts = {**dict.fromkeys(weights, "model-00001-of-00002.safetensors"), "head.conv1.weight": "model-00002-of-00002.safetensors"}
+    (folder / "model.safetensors.index.json").write_text(json.dumps({"weight_map": parts}))
+
+
+POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:abc\nsize 99\n"
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (
+            lambda folder: (folder / "model.safetensors").unlink(),
+            r"holds no weights: model\.safetensors is missing; download the folder again",
+        ),
+        (in_two_files, r"lacks model-00002-of-00002\.safetensors, which model\.safetensors\.index\.json names; download it again"),
+        (
+            lambda folder: (folder / "model.safetensors").write_text(POINTER),
+            "is a Git LFS pointer, not the weights; fetch them: git lfs pull",
+        ),
+        (lambda folder: (folder / "model.safetensors").write_bytes(b""), r"model\.safetensors is empty; download it again"),
+        (
+            lambda folder: os.truncate(folder / "model.safetensors", 100_000),
+            r"is no whole safetensors file \(100,000 bytes: .*\); download it",
+        ),
+        (lambda folder: (folder / "config.json").write_text("{oops"), r"cannot be loaded: .*config\.json"),
+        (lambda folder: (folder / "preprocessor_config.json").unlink(), r"cannot be loaded: .*preprocessor_config\.json"),
+        (
+            lambda folder: (folder / "preprocessor_config.json").write_text("{oops"),
+            r"its preprocessor_config\.json is no JSON .*; download it",
+        ),
+        (lambda folder: (folder / "preprocessor_config.json").write_text("[]"), r"holds options by name; got \[\]\. Download it again"),
+        (of_another_class, r"is no depth network: its config\.json says vit ViTForImageClassification; name one that"),
+    ],
+)
+def test_a_folder_that_cannot_work_is_refused_as_the_stream_is_made(copy, tmp_path, spoil, message):
+    tar = photo_tar(tmp_path / "photos.tar", 1)
+    spoil(copy)
+    with pytest.raises((OSError, ValueError), match=f'^depth="{copy}".*{message}'):
+        ZeroStereoStream(tar, depth=copy)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "wanted"),
+    [
+        ("size", {"longest_edge": 70}, "a number of pixels, or height and width"),
+        ("size", "big", "a number of pixels, or height and width"),
+        ("image_mean", 0.5, "three numbers"),
+        ("image_mean", [0.5], "three numbers"),
+        ("image_std", [1, 0, 1], "three numbers above 0"),
+        ("rescale_factor", "1/255", "a number above 0"),
+        ("do_rescale", "no", "true or false"),
+        ("resample", [3], "a whole number"),
+    ],
+)
+def test_a_preprocessing_that_makes_no_sense_is_named(copy, option, value, wanted):
+    change(copy, "preprocessor_config.json", **{option: value})
+    with pytest.raises(
+        ValueError, match=rf'^depth="{copy}": {option} in its .* is {wanted}; got {re.escape(repr(value))}\. Download it again'
+    ):
+        load_preprocessing(DepthNetwork(str(copy)))
+
+
+def test_weights_of_another_shape_are_named(copy):
+    change(copy, "config.json", head_hidden_size=16)
+    with pytest.raises(
+        ValueError, match=r'^depth=".*" has 3 weights of another shape than its config\.json says, "head\.conv2\.bias" for one'
+    ):
+        load_depth(copy)
+
+
+@pytest.mark.parametrize("depth", [None, 3, ["a"], b"builtin"])
+def test_what_is_no_depth_is_said(depth, tmp_path):
+    tar = photo_tar(tmp_path / "photos.tar", 1)
+    for use in (load_depth, lambda depth: ZeroStereoStream(tar, depth=depth)):
+        with pytest.raises(TypeError, match=rf'^depth is "builtin", "stored", a Hub id, .*; got {re.escape(repr(depth))}$'):
+            use(depth)
 
 
 def test_missing_weights_are_named(copy):

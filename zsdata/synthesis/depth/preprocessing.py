@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -126,26 +126,59 @@ class Preprocessing:
         return int(math.sqrt(height / 2) * REFLECTED_SHARE), int(math.sqrt(width / 2) * REFLECTED_SHARE)
 
 
-def read_preprocessing(name: str, folder: Mapping[str, Any], config: Any, resolution: int | Literal["native"] | None) -> Preprocessing:
+def _is_number(value: Any, above: float = -math.inf) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and above < value < math.inf
+
+
+def _are_channels(value: Any, above: float = -math.inf) -> bool:
+    return isinstance(value, list | tuple) and len(value) == 3 and all(_is_number(one, above) for one in value)
+
+
+def _is_size(value: Any) -> bool:
+    sides = list(value.values()) if isinstance(value, dict) and value.keys() in ({"height", "width"}, {"shortest_edge"}) else [value]
+    return all(isinstance(side, int) and _is_number(side, 0) for side in sides)
+
+
+# What a folder may say, in words and as a test.
+OPTIONS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    **dict.fromkeys(("do_resize", "do_rescale", "do_normalize", "do_pad"), ("true or false", lambda value: isinstance(value, bool))),
+    **dict.fromkeys(("rescale_factor", "ensure_multiple_of", "size_divisor"), ("a number above 0", lambda value: _is_number(value, 0))),
+    "resample": ("a whole number", lambda value: isinstance(value, int)),
+    "size": ("a number of pixels, or height and width", _is_size),
+    "image_mean": ("three numbers", _are_channels),
+    "image_std": ("three numbers above 0", lambda value: _are_channels(value, 0)),
+}
+
+
+def read_preprocessing(name: str, folder: Any, config: Any, resolution: int | Literal["native"] | None) -> Preprocessing:
     """What the folder of a network says.
 
     Args:
         name: of the network, for messages.
-        folder: its preprocessor_config.json.
+        folder: its preprocessor_config.json, as JSON has it.
         config: the network's configuration (transformers).
         resolution: as in `DepthNetwork`.
 
     Raises:
-        ValueError: an image processor that is not known, or a resolution that the network cannot take.
+        ValueError: an image processor that is not known, an option that has no such value, or a resolution that the network cannot take.
     """
+    if not isinstance(folder, dict):
+        raise ValueError(f'depth="{name}": its preprocessor_config.json holds options by name; got {folder!r}. Download it again')
     processor = folder.get("image_processor_type") or folder.get("feature_extractor_type") or ""
-    kind = re.sub(r"(ImageProcessor|FeatureExtractor)(Fast|Pil)?$", "", processor)
+    kind = re.sub(r"(ImageProcessor|FeatureExtractor)(Fast|Pil)?$", "", str(processor))
     if kind not in CLASS_DEFAULTS:
         raise ValueError(
             f'depth="{name}" wants its photos prepared by {processor or "an image processor that it does not name"}; known are those of '
             f"{', '.join(CLASS_DEFAULTS)}. Load it yourself and give the stream a callable"
         )
     told = {**CLASS_DEFAULTS[kind], **{key: value for key, value in folder.items() if value is not None}}
+    for option in told.keys() & OPTIONS.keys():
+        wanted, fits = OPTIONS[option]
+        if not fits(told[option]):
+            raise ValueError(
+                f'depth="{name}": {option} in its preprocessor_config.json is {wanted}; got {told[option]!r}. Download it again, or load '
+                "the network yourself and give the stream a callable"
+            )
     if told["resample"] not in RESAMPLING:
         raise ValueError(f'depth="{name}" resizes photos by method {told["resample"]}; known are {RESAMPLING}')
 

@@ -10,13 +10,14 @@ import math
 import os
 import re
 from collections import defaultdict
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from zsdata.synthesis.depth.model_folder import check_weights
 from zsdata.synthesis.depth.options import DepthNetwork
 from zsdata.synthesis.depth.preprocessing import Preprocessing, read_preprocessing
 from zsdata.synthesis.micro_batch import MicroBatch, WarmUp, measure, weight_bytes
@@ -51,8 +52,9 @@ class PretrainedDepth:
 
     Raises:
         ImportError: transformers is not installed.
-        OSError: nothing is found under that name.
-        ValueError: weights are missing, or it is not known how photos are prepared for this kind of network or what it predicts.
+        OSError: nothing is found under that name, or a folder lacks a file.
+        ValueError: files are damaged or not those of a depth network, weights are missing, or it is not known how photos are prepared for
+            this kind of network or what it predicts.
     """
 
     def __init__(self, network: DepthNetwork, device: str | torch.device = "cpu") -> None:
@@ -61,11 +63,19 @@ class PretrainedDepth:
         self.preprocessing = load_preprocessing(network)
         from transformers import AutoModelForDepthEstimation
 
-        with torch.random.fork_rng(devices=[]):  # older transformers fill the weights with random numbers first
-            loaded, report = AutoModelForDepthEstimation.from_pretrained(network.name, revision=network.revision, output_loading_info=True)
+        with _naming(network), torch.random.fork_rng(devices=[]):  # older transformers fill the weights with random numbers first
+            loaded, report = AutoModelForDepthEstimation.from_pretrained(
+                network.name, revision=network.revision, output_loading_info=True, ignore_mismatched_sizes=True
+            )
         missing = sorted(key for key in report["missing_keys"] if not NEVER_USED.search(key))
         if missing:
             raise ValueError(f'depth="{network.name}" lacks {len(missing)} weights, "{missing[0]}" for one; download it again')
+        other = sorted(key if isinstance(key, str) else key[0] for key in report["mismatched_keys"])
+        if other:
+            raise ValueError(
+                f'depth="{network.name}" has {len(other)} weights of another shape than its config.json says, "{other[0]}" for one; '
+                "download both again"
+            )
         self._predicts_depth = (network.predicts or _predicts(network.name, loaded.config)) == "depth"
         self._network: Any = loaded.to(self.device, torch.float32).eval().requires_grad_(False)  # saved in half precision or not
         if self.device.type == "cuda":
@@ -181,20 +191,44 @@ def load_preprocessing(network: DepthNetwork) -> Preprocessing:
             f'depth="{network.name}" is neither "builtin", "stored", a folder that is there, nor a Hub id ("owner/name")'
         )
     try:
-        from transformers import AutoConfig
+        from transformers import MODEL_FOR_DEPTH_ESTIMATION_MAPPING, AutoConfig
         from transformers.utils.hub import cached_file
     except ImportError as error:
         raise ImportError(f'depth="{network.name}" needs transformers: pip install "zsdata[depth]"') from error
-    try:
+    with _naming(network):
         config = AutoConfig.from_pretrained(network.name, revision=network.revision)
         path = cached_file(network.name, "preprocessor_config.json", revision=network.revision)
-    except OSError as error:
-        which = "" if network.revision is None else f', revision "{network.revision}",'
-        raise OSError(f'depth="{network.name}"{which} cannot be loaded: {error}') from error
-    except ValueError as error:  # no config.json, or one of a network that this transformers does not know
-        raise ValueError(f'depth="{network.name}" cannot be loaded: {error}') from error
+    built_as = getattr(config, "architectures", None) or []
+    if type(config) not in MODEL_FOR_DEPTH_ESTIMATION_MAPPING or (built_as and not any("Depth" in one for one in built_as)):
+        raise ValueError(
+            f'depth="{network.name}" is no depth network: its config.json says {" ".join([config.model_type, *built_as])}; name one that '
+            "transformers loads by AutoModelForDepthEstimation"
+        )
+    if os.path.isdir(network.name):
+        check_weights(network.name)
     with open(str(path), encoding="utf-8") as file:
-        return read_preprocessing(network.name, json.load(file), config, network.resolution)
+        try:
+            said = json.load(file)
+        except ValueError as error:
+            raise ValueError(f'depth="{network.name}": its preprocessor_config.json is no JSON ({error}); download it again') from error
+    return read_preprocessing(network.name, said, config, network.resolution)
+
+
+@contextmanager
+def _naming(network: DepthNetwork) -> Iterator[None]:
+    """Errors of transformers say which network they are about, and what can be done."""
+    which = f'depth="{network.name}"' + ("" if network.revision is None else f', revision "{network.revision}",')
+    try:
+        yield
+    except OSError as error:
+        raise OSError(f"{which} cannot be loaded: {error}") from error
+    except ImportError:  # names the package that a network needs beside transformers
+        raise
+    except Exception as error:  # what a damaged folder leads to is not foretold
+        raise ValueError(
+            f"{which} cannot be loaded: {error} Its files are damaged or of different networks: download them again; or this transformers "
+            "does not know the network: upgrade it"
+        ) from error
 
 
 def _predicts(name: str, config: Any) -> str:
