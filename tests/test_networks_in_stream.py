@@ -1,15 +1,18 @@
 import json
 import os
+import shutil
 import subprocess
 import sys
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
 from tests.scenes import grey_fill, layered_depth, photo, photo_tar, png, write_tar
 from zsdata import QualityGate, ZeroStereoStream, load_depth
 from zsdata.licences import NonCommercialModel
 from zsdata.synthesis.depth import DepthNetwork
+from zsdata.synthesis.depth.pretrained import PretrainedDepth
 from zsdata.synthesis.inpaint import DiffusionNetwork
 
 small = pytest.importorskip("tests.small_depth_networks")
@@ -68,6 +71,27 @@ def test_a_strip_is_counted_before_a_network_sees_it(folder, tmp_path, placement
         used = {sample["key"] for batch in loader for sample in batch.meta}
         assert used == {"0", "3"}
         assert loader.stats()["rejected"] == {"too long for the depth network": 2}
+
+
+@pytest.mark.parametrize("placement", ["worker", "device"])
+def test_depth_that_is_not_finite_names_the_sample_and_the_cure(folder, tar, tmp_path, placement):
+    spoilt = shutil.copytree(folder, tmp_path / "spoilt")
+    weights = load_file(spoilt / "model.safetensors")
+    save_file(
+        {**weights, "head.conv1.bias": weights["head.conv1.bias"] * torch.nan}, spoilt / "model.safetensors", metadata={"format": "pt"}
+    )
+    stream = ZeroStereoStream(tar, size=SIZE, depth=spoilt, inpaint=grey_fill, depth_placement=placement)
+    message = r"sample \d of epoch 0 \(.*photos\.tar\) failed: inverse depth must be finite.*float32"
+    with pytest.raises(RuntimeError, match=message), stream.loader(3) as loader:
+        next(iter(loader))
+
+
+def test_a_network_that_fails_on_the_device_names_its_photos(folder, tar, monkeypatch):
+    stream = ZeroStereoStream(tar, size=SIZE, depth=folder, inpaint=grey_fill, depth_placement="device")
+    with stream.loader(3) as loader:
+        monkeypatch.setattr(PretrainedDepth, "_run", lambda self, inputs: inputs.nonsense)
+        with pytest.raises(RuntimeError, match=r'"00000\d" in .*photos\.tar, "00000\d" in .*photos\.tar, "00000\d" in .*photos\.tar$'):
+            next(iter(loader))
 
 
 def test_a_network_that_takes_squares_sees_strips(tmp_path):

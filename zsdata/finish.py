@@ -5,8 +5,8 @@ Where depth is the device's work too, it first makes the pairs: the same functio
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -66,12 +66,14 @@ class Synthesis:
         config = self.recipe.synthesis
         photos = [draft.photo.to(device, non_blocking=True) for draft in drafts.values() if draft.photo is not None]
         if as_network(self.recipe.depth) is not None:
-            found = predict_depth(self.depth, photos, [tuple(draft.meta["photo_size"]) for draft in drafts.values()], config)
+            with _naming_photos(drafts):
+                maps = predict_depth(self.depth, photos, [tuple(draft.meta["photo_size"]) for draft in drafts.values()], config)
         else:
-            found = []
-            for photo, draft in zip(photos, drafts.values(), strict=True):
-                with naming(draft.meta):
-                    found.append(estimate_depth(self.depth, photo.float(), config))
+            maps = (estimate_depth(self.depth, photo.float(), config) for photo in photos)
+        found = []
+        for draft in drafts.values():
+            with naming(draft.meta):
+                found.append(next(maps))
         if self.recipe.depth_cache is not None:
             for draft, depth in zip(drafts.values(), found, strict=True):
                 store_depth(self.recipe.depth_cache, draft.digest, depth)
@@ -80,6 +82,18 @@ class Synthesis:
 
 def _photo(draft: Draft) -> tuple[str, str]:
     return draft.meta["shard"], draft.meta["key"]
+
+
+@contextmanager
+def _naming_photos(photos: Iterable[tuple[str, str]]) -> Iterator[None]:
+    """Errors of work on many photos at once say which they are. One photo that memory does not hold is the device's affair."""
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:
+        listed = ", ".join(f'"{key}" in {shard}' for shard, key in photos)
+        raise RuntimeError(f"the depth network failed: {error} The photos that it was given: {listed}") from error
 
 
 @dataclass(frozen=True)

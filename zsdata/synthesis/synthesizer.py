@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -92,17 +92,22 @@ def given_depth(inverse_depth: Tensor) -> DepthMaps:
     return _depth_maps(inverse_depth, None)
 
 
-def predict_depth(depth: Any, prepared: Sequence[Tensor], sizes: Sequence[tuple[int, int]], config: SynthesisConfig) -> list[DepthMaps]:
-    """As `estimate_depth`, of photos of several sizes that an estimator with two halves has prepared elsewhere; one map per photo.
+def predict_depth(depth: Any, prepared: Sequence[Tensor], sizes: Sequence[tuple[int, int]], config: SynthesisConfig) -> Iterator[DepthMaps]:
+    """As `estimate_depth`, of photos of several sizes that an estimator with two halves has prepared elsewhere.
 
     Args:
         depth: an estimator with `predict` and `predict_mirrored`.
         prepared: what its `prepare` made of each photo.
         sizes: (height, width) of the photos.
+
+    Returns:
+        One map per photo. The estimator has done its work when this returns; each map is checked when it is taken.
     """
     if config.flip_confidence:
-        return [_depth_maps(estimate, mirrored) for estimate, mirrored in depth.predict_mirrored(prepared, sizes)]
-    return [_depth_maps(estimate, None) for estimate in depth.predict(prepared, sizes)]
+        estimates: Sequence[tuple[Tensor, Tensor | None]] = depth.predict_mirrored(prepared, sizes)
+    else:
+        estimates = [(estimate, None) for estimate in depth.predict(prepared, sizes)]
+    return (_depth_maps(*maps) for maps in estimates)
 
 
 def _depth_maps(estimate: Tensor, mirrored: Tensor | None) -> DepthMaps:
