@@ -145,6 +145,27 @@ def test_auto_keeps_depth_in_the_workers_where_the_loader_has_no_gpu(folder, tar
         assert "prepare" not in loader.stats()["seconds"]
 
 
+class OnGpu:
+    """An estimator that says it is on a GPU, as a network does that was loaded there; counts its calls in this process."""
+
+    device, calls = torch.device("cuda", 0), 0
+
+    def __call__(self, images):
+        self.calls += 1
+        return layered_depth(images)
+
+
+def test_a_network_that_was_loaded_onto_a_gpu_stays_out_of_the_workers(tar):
+    depth = OnGpu()
+    with ZeroStereoStream(tar, size=SIZE, depth=depth, inpaint=grey_fill).loader(3, num_workers=1) as loader:
+        next(iter(loader))
+    assert depth.calls > 0
+    with pytest.raises(
+        ValueError, match=r'the network that was given is on cuda:0; load it onto the CPU \(load_depth\(\.\.\., device="cpu"\)\)'
+    ):
+        ZeroStereoStream(tar, size=SIZE, depth=depth, depth_placement="worker")
+
+
 def test_options_that_change_no_picture_do_not_change_the_place(folder, tar):
     state = ZeroStereoStream(tar, size=SIZE, depth=DepthNetwork(str(folder), micro_batch=2)).state_dict()
     ZeroStereoStream(tar, size=SIZE, depth=DepthNetwork(str(folder), dtype="float32", micro_batch=16)).load_state_dict(state)
