@@ -52,6 +52,21 @@ def test_a_network_gives_the_same_labels_in_the_workers_and_on_the_device(folder
                 assert (mask != other_mask).float().mean() <= 0.001
 
 
+@pytest.mark.parametrize("batch_size", [2, 3, 8])
+@pytest.mark.parametrize("workers", [0, 1])
+def test_the_views_of_a_photo_cost_one_estimate_on_the_device_whatever_batches_cut_through_them(
+    folder, tar, monkeypatch, batch_size, workers
+):
+    images, run = [], PretrainedDepth._run
+    monkeypatch.setattr(PretrainedDepth, "_run", lambda self, inputs: images.append(len(inputs)) or run(self, inputs))
+    stream = ZeroStereoStream(
+        tar, size=SIZE, depth=folder, inpaint=grey_fill, views_per_image=8, depth_placement="device", quality=ALL_PASS
+    )
+    with stream.loader(batch_size, num_workers=workers) as loader:
+        assert len(list(loader)) == 6 * 8 // batch_size
+    assert sum(images) == 6 * 2  # photos, each with its mirror image
+
+
 def test_the_resolution_reaches_the_network(folder, tar):
     coarse, fine = (next(iter(ZeroStereoStream(tar, size=SIZE, depth=folder, depth_resolution=side))) for side in (42, 140))
     assert not torch.equal(coarse.disparity, fine.disparity)

@@ -32,21 +32,26 @@ class Synthesis:
     depth: DepthEstimator | None  # None: every draft has its depth
     recipe: Recipe
     worker: Worker  # of the same recipe: draws what stands in for a pair that the quality gate refuses
+    _last: dict[tuple[str, str], DepthMaps] = field(default_factory=dict)  # of the last photo: its next view may begin the next batch
 
     def __call__(self, drafts: Drafts, device: torch.device, meter: Meter) -> Prepared:
-        """The pairs of a batch of drafts, on the device; a photo's depth is estimated once, however many views of it are in the batch."""
+        """The pairs of a batch of drafts, on the device; a photo's depth is estimated once, however many views follow one another."""
         drawn = list(drafts.drafts)
         made: dict[int, Prepared] = {}
+        known = dict(self._last)
         while len(made) < len(drawn):
             missing = {place: draft for place, draft in enumerate(drawn) if place not in made}
             with meter.stage("depth"):
-                known = self._estimate({_photo(draft): draft for draft in missing.values() if draft.depth is None}, device)
+                unknown = {_photo(draft): draft for draft in missing.values() if draft.depth is None and _photo(draft) not in known}
+                known.update(self._estimate(unknown, device))
             for place, draft in missing.items():
                 depth = draft.depth if draft.depth is not None else known[_photo(draft)]
                 try:
                     made[place] = self._make(draft, depth, device, meter)
                 except BadPhoto as fault:
                     drawn[place] = self.worker.instead(draft, fault.reason)
+        self._last.clear()
+        self._last.update({photo: depth for photo, depth in known.items() if photo == _photo(drawn[-1])})
         pairs = Prepared.stack([made[place] for place in range(len(drawn))])
         meta = [{**pairs.meta[row], "index": sample["index"]} for row, sample in zip(drafts.rows, drafts.meta, strict=True)]
         rejected = [reject for draft in drawn for reject in draft.rejected]
