@@ -51,6 +51,34 @@ def midas_vit() -> Any:
     return hf.DPTForDepthEstimation(config)
 
 
+def midas_hybrid() -> Any:
+    backbone = {
+        "model_type": "bit",
+        "global_padding": "same",
+        "layer_type": "bottleneck",
+        "depths": [1, 1, 1],
+        "out_features": STAGES[:3],
+        "embedding_dynamic_padding": True,
+        "hidden_sizes": [8, 16, 32],
+        "embedding_size": 8,
+        "num_groups": 4,
+    }
+    config = hf.DPTConfig(
+        **VIT,
+        neck_hidden_sizes=[8, 16, 32, 32],
+        fusion_hidden_size=16,
+        intermediate_size=64,
+        image_size=64,
+        patch_size=16,
+        is_hybrid=True,
+        backbone_config=backbone,
+        backbone_featmap_shape=[1, 32, 4, 4],
+        backbone_out_indices=[0, 1, 2, 3],
+        neck_ignore_stages=[0, 1],
+    )
+    return hf.DPTForDepthEstimation(config)
+
+
 def midas_beit() -> Any:
     return hf.DPTForDepthEstimation(hf.DPTConfig(backbone_config=beit(), hidden_size=32, **NECK))
 
@@ -139,6 +167,7 @@ NETWORKS: dict[str, tuple[Callable[[], Any], str, dict[str, Any]]] = {
     "depth_anything": (depth_anything, DPT, {"size": SQUARE_70, **PATCHES, **IMAGENET}),
     "metric_depth_anything": (metric_depth_anything, DPT, {"size": SQUARE_70, **PATCHES, **IMAGENET}),
     "midas_vit": (midas_vit, DPT, {"size": {"height": 64, "width": 64}, "resample": 2}),
+    "midas_hybrid": (midas_hybrid, DPT, {"size": {"height": 64, "width": 64}, "resample": 2}),
     "midas_beit": (midas_beit, DPT, {"size": {"height": 64, "width": 64}, "keep_aspect_ratio": True, "ensure_multiple_of": 32}),
     "midas_swin": (midas_swin, DPT, {"size": {"height": 64, "width": 64}, "keep_aspect_ratio": True, "ensure_multiple_of": 32}),
     "dinov2_dpt": (dinov2_dpt, DPT, {"do_resize": False, "do_pad": True, "size_divisor": 14, **IMAGENET_GREY_LEVELS}),

@@ -83,6 +83,7 @@ def test_every_kind_of_network_gives_a_finite_map_of_the_photos_size(folders, ki
         ("depth_anything", 90, 131),
         ("metric_depth_anything", 160, 100),
         ("midas_vit", 90, 131),
+        ("midas_hybrid", 90, 131),
         ("midas_beit", 90, 131),
         ("midas_swin", 90, 131),
         ("dinov2_dpt", 84, 126),  # where the size is right already: transformers pads or cuts where this resizes
@@ -179,10 +180,12 @@ def test_networks_that_take_squares_get_squares(folders):
         load_depth(folders("midas_vit"), resolution="native")
 
 
-@needs_depth_pro
-def test_depth_pro_takes_one_size(folders):
-    with pytest.raises(ValueError, match="takes 56x56 pixels and nothing else; got resolution=112"):
-        load_depth(folders("depth_pro"), resolution=112)
+@pytest.mark.parametrize(("kind", "side"), [pytest.param("depth_pro", 56, marks=needs_depth_pro), ("midas_hybrid", 64)])
+@pytest.mark.parametrize("resolution", [112, "native"])
+def test_networks_that_take_one_size_are_given_no_other(folders, kind, side, resolution):
+    with pytest.raises(ValueError, match=f"takes {side}x{side} pixels and nothing else; got resolution={resolution!r}"):
+        load_preprocessing(DepthNetwork(str(folders(kind)), resolution))
+    assert load_preprocessing(DepthNetwork(str(folders(kind)), side)).input_size(90, 131) == (side, side)
 
 
 @pytest.mark.parametrize("kind", small.NETWORKS)
@@ -392,6 +395,7 @@ def test_one_pixel_at_no_distance_changes_nothing_else(folder):
         ("depth_anything", "inverse depth"),
         ("metric_depth_anything", "depth"),
         ("midas_vit", "inverse depth"),
+        ("midas_hybrid", "inverse depth"),
         ("dinov2_dpt", "depth"),
         ("glpn", "depth"),
         ("zoe", "depth"),

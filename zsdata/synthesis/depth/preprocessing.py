@@ -186,7 +186,7 @@ def read_preprocessing(name: str, folder: Any, config: Any, resolution: int | Li
     short_side_px = None if own is None else int(own if isinstance(own, int) else min(own.values()))
     square = _takes_squares_alone(config)
     if resolution is not None:
-        if config.model_type == "depth_pro" and resolution != short_side_px:
+        if _takes_one_size(config) and resolution != short_side_px:
             raise ValueError(f'depth="{name}" takes {short_side_px}x{short_side_px} pixels and nothing else; got resolution={resolution!r}')
         if square and resolution == "native":
             raise ValueError(f'depth="{name}" takes squares alone: resolution is a number of pixels or None; got "native"')
@@ -210,6 +210,11 @@ def _takes_squares_alone(config: Any) -> bool:
     if config.model_type == "depth_pro":
         return True
     return config.model_type == "dpt" and (getattr(config, "backbone_config", None) is None or getattr(config, "is_hybrid", False))
+
+
+def _takes_one_size(config: Any) -> bool:
+    """Depth Pro's grid of patches, and the features that DPT on a hybrid of convolutions and ViT expects, have one size."""
+    return config.model_type == "depth_pro" or (config.model_type == "dpt" and getattr(config, "is_hybrid", False))
 
 
 def _multiple_px(told: Mapping[str, Any], config: Any) -> int:
