@@ -389,6 +389,27 @@ def test_one_pixel_at_no_distance_changes_nothing_else(folder):
     assert different.nonzero().tolist() == [[0, 0, 50, 60]] and made[1][0, 0, 50, 60] == 1
 
 
+def test_zoe_depth_without_padding_still_aligns_corners(folders, tmp_path):
+    path = shutil.copytree(folders("zoe"), tmp_path / "zoe")
+    change(path, "preprocessor_config.json", do_pad=False)
+    image = photos(1, 90, 131)
+    expected = F.interpolate(image, (64, 96), mode="bilinear", align_corners=True)
+    prepared = load_preprocessing(DepthNetwork(str(path))).prepare(image)
+    assert prepared.shape == expected.shape and (prepared - expected).abs().max() <= 0.5
+
+
+def test_zoe_depth_resized_by_cubic_curves_stays_within_0_and_255(folders, tmp_path):
+    path = shutil.copytree(folders("zoe"), tmp_path / "zoe")
+    change(path, "preprocessor_config.json", resample=3)
+    checks = torch.zeros(1, 3, 32, 32)
+    checks[..., ::3, :] = 255.0
+    padded = F.pad(checks, (12, 12, 12, 12), mode="reflect")
+    expected = F.interpolate(padded, (64, 64), mode="bicubic", align_corners=True)
+    assert expected.min() < -10
+    prepared = load_preprocessing(DepthNetwork(str(path))).prepare(checks)
+    assert (prepared - expected.clamp(0, 255)).abs().max() <= 0.5
+
+
 @pytest.mark.parametrize(
     ("kind", "predicts"),
     [

@@ -37,6 +37,7 @@ CLASS_DEFAULTS: dict[str, dict[str, Any]] = {
         "image_mean": HALF,
         "image_std": HALF,
         "antialias": False,
+        "align_corners": True,
         "reflect": True,
     },
 }
@@ -57,7 +58,8 @@ class Preprocessing:
         rescale: what grey levels 0..255 are multiplied by before they are normalised.
         mean, std: of the channels, for values that are rescaled.
         mode: how photos are resized: "bilinear" or "bicubic".
-        antialias: whether a photo that shrinks is smoothed; without it corners are aligned, where `reflect` is set.
+        antialias: whether a photo that shrinks is smoothed.
+        align_corners: whether the centres of the corner pixels stay where they are; not with `antialias`.
         reflect: whether the photo is continued at its edges by reflection first, and the prediction cut to the photo again.
     """
 
@@ -69,6 +71,7 @@ class Preprocessing:
     std: tuple[float, ...]
     mode: str
     antialias: bool
+    align_corners: bool
     reflect: bool
 
     def input_size(self, height: int, width: int) -> tuple[int, int]:
@@ -98,13 +101,12 @@ class Preprocessing:
             images = images.round().clamp(0, 255).to(torch.uint8)
         if self.reflect:
             rows, columns = self._margins(*images.shape[-2:])
-            images = F.pad(images.float(), (columns, columns, rows, rows), mode="reflect")
-            return F.interpolate(images, size, mode=self.mode, align_corners=True).round_().to(torch.uint8)
+            images = F.pad(images.float(), (columns, columns, rows, rows), mode="reflect").to(torch.uint8)
         if tuple(images.shape[-2:]) == size:
             return images
         if self.antialias and images.device.type == "cpu":  # whole numbers all the way, and several times as fast
             return F.interpolate(images, size, mode=self.mode, antialias=True, align_corners=False)
-        resized = F.interpolate(images.float(), size, mode=self.mode, antialias=self.antialias, align_corners=False)
+        resized = F.interpolate(images.float(), size, mode=self.mode, antialias=self.antialias, align_corners=self.align_corners)
         return resized.round_().clamp_(0, 255).to(torch.uint8)
 
     def normalise(self, inputs: Tensor) -> Tensor:
@@ -171,7 +173,8 @@ def read_preprocessing(name: str, folder: Any, config: Any, resolution: int | Li
             f'depth="{name}" wants its photos prepared by {processor or "an image processor that it does not name"}; known are those of '
             f"{', '.join(CLASS_DEFAULTS)}. Load it yourself and give the stream a callable"
         )
-    told = {**CLASS_DEFAULTS[kind], **{key: value for key, value in folder.items() if value is not None}}
+    defaults = CLASS_DEFAULTS[kind]
+    told = {**defaults, **{key: value for key, value in folder.items() if value is not None}}
     for option in told.keys() & OPTIONS.keys():
         wanted, fits = OPTIONS[option]
         if not fits(told[option]):
@@ -200,8 +203,9 @@ def read_preprocessing(name: str, folder: Any, config: Any, resolution: int | Li
         mean=tuple(told["image_mean"]) if normalised else (0.0, 0.0, 0.0),
         std=tuple(told["image_std"]) if normalised else (1.0, 1.0, 1.0),
         mode=RESAMPLING[told["resample"]],
-        antialias=told.get("antialias", True),
-        reflect=bool(told.get("reflect") and told.get("do_pad", True)),
+        antialias=defaults.get("antialias", True),
+        align_corners=defaults.get("align_corners", False),
+        reflect=defaults.get("reflect", False) and told.get("do_pad", True),
     )
 
 
