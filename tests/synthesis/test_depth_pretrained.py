@@ -346,6 +346,14 @@ def test_a_revision_is_found_in_the_hub_cache_without_network(folder, tmp_path):
     assert result.returncode == 0, result.stderr
 
 
+def test_a_folder_has_no_revisions(folder, tmp_path):
+    tar = photo_tar(tmp_path / "photos.tar", 1)
+    message = f"depth=\"{folder}\" is a folder, which has no revisions; got revision='v1'. Leave revision out"
+    for use in (load_depth, lambda depth: ZeroStereoStream(tar, depth=depth)):
+        with pytest.raises(ValueError, match=message):
+            use(DepthNetwork(str(folder), revision="v1"))
+
+
 def test_the_cache_tells_options_apart(folder):
     plain, native, half = (depth_identity(DepthNetwork(str(folder), **o)) for o in ({}, {"resolution": "native"}, {"dtype": "bf16"}))
     assert plain == depth_identity(folder) and len({plain, native, half}) == 3

@@ -20,7 +20,7 @@ class DepthNetwork:
         name: a Hub id, such as "depth-anything/Depth-Anything-V2-Small-hf", or a local folder.
         resolution: the short side of the network's input in pixels, rounded to whole patches; "native" is the photo's own size; None is
             the size that the network's folder states.
-        revision: branch, tag or commit of a Hub id.
+        revision: branch, tag or commit of a Hub id; a folder has none.
         predicts: "inverse depth" or "depth"; None tells by the network's configuration.
         dtype: of the computation: "float32", without TF32, so that labels do not depend on where depth is estimated; or "bf16" or "fp16"
             (autocast; the last layers stay in float32), which are faster on a GPU and change the labels.

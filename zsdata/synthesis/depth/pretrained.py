@@ -190,6 +190,11 @@ def load_preprocessing(network: DepthNetwork) -> Preprocessing:
         raise FileNotFoundError(
             f'depth="{network.name}" is neither "builtin", "stored", a folder that is there, nor a Hub id ("owner/name")'
         )
+    if os.path.isdir(network.name) and network.revision is not None:
+        raise ValueError(
+            f'depth="{network.name}" is a folder, which has no revisions; got revision={network.revision!r}. Leave revision out, or give '
+            "the Hub id"
+        )
     try:
         from transformers import MODEL_FOR_DEPTH_ESTIMATION_MAPPING, AutoConfig
         from transformers.utils.hub import cached_file
