@@ -114,6 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         library.logging.disable_progress_bar()
     name = cpu_name() if device.type == "cpu" else torch.cuda.get_device_name(device)
     dtype = choose_dtype(options.dtype, device)
+    options.dtype = str(dtype).removeprefix("torch.")  # depth has no other format on a GPU by itself
     matmul = matmul_tflops(device, dtype, options)
     print(
         f"{name}, torch {torch.__version__}, Python {platform.python_version()}, {options.size[0]}x{options.size[1]}, {dtype}; "

@@ -14,6 +14,7 @@ STAGES = ["stage1", "stage2", "stage3", "stage4"]
 NECK: dict[str, Any] = {"neck_hidden_sizes": [8, 16, 24, 32], "fusion_hidden_size": 16}
 VIT: dict[str, Any] = {"hidden_size": 32, "num_hidden_layers": 4, "num_attention_heads": 2}
 IMAGENET = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
+IMAGENET_GREY_LEVELS = {"do_rescale": False, "image_mean": [123.675, 116.28, 103.53], "image_std": [58.395, 57.12, 57.375]}
 
 
 def dinov2() -> Any:
@@ -46,6 +47,34 @@ def metric_depth_anything() -> Any:
 def midas_vit() -> Any:
     config = hf.DPTConfig(
         **VIT, **NECK, intermediate_size=64, image_size=64, patch_size=16, backbone_out_indices=[0, 1, 2, 3], is_hybrid=False
+    )
+    return hf.DPTForDepthEstimation(config)
+
+
+def midas_hybrid() -> Any:
+    backbone = {
+        "model_type": "bit",
+        "global_padding": "same",
+        "layer_type": "bottleneck",
+        "depths": [1, 1, 1],
+        "out_features": STAGES[:3],
+        "embedding_dynamic_padding": True,
+        "hidden_sizes": [8, 16, 32],
+        "embedding_size": 8,
+        "num_groups": 4,
+    }
+    config = hf.DPTConfig(
+        **VIT,
+        neck_hidden_sizes=[8, 16, 32, 32],
+        fusion_hidden_size=16,
+        intermediate_size=64,
+        image_size=64,
+        patch_size=16,
+        is_hybrid=True,
+        backbone_config=backbone,
+        backbone_featmap_shape=[1, 32, 4, 4],
+        backbone_out_indices=[0, 1, 2, 3],
+        neck_ignore_stages=[0, 1],
     )
     return hf.DPTForDepthEstimation(config)
 
@@ -97,6 +126,40 @@ def depth_pro() -> Any:
     return hf.DepthProForDepthEstimation(config)
 
 
+def tipsv2() -> Any:
+    backbone = hf.Tipsv2VisionConfig(
+        **VIT, mlp_ratio=2, image_size=70, patch_size=14, out_indices=[1, 2, 3, 4], reshape_hidden_states=False
+    )
+    return hf.Tipsv2DptForDepthEstimation(hf.Tipsv2DptConfig(backbone_config=backbone, **NECK))
+
+
+def chmv2() -> Any:
+    backbone = hf.DINOv3ViTConfig(
+        **VIT,
+        intermediate_size=64,
+        image_size=64,
+        patch_size=16,
+        out_indices=[1, 2, 3, 4],
+        reshape_hidden_states=True,
+        return_class_token=True,
+        apply_layernorm=True,
+    )
+    head = {
+        "post_process_channels": NECK["neck_hidden_sizes"],
+        "fusion_hidden_size": 16,
+        "head_hidden_size": 8,
+        "number_output_channels": 32,
+    }
+    return hf.CHMv2ForDepthEstimation(hf.CHMv2Config(backbone_config=backbone, **head))
+
+
+def prompt_depth_anything() -> Any:
+    config = hf.PromptDepthAnythingConfig(
+        backbone_config=dinov2(), reassemble_hidden_size=32, **NECK, head_hidden_size=8, depth_estimation_type="metric", max_depth=20
+    )
+    return hf.PromptDepthAnythingForDepthEstimation(config)
+
+
 DPT, SQUARE_70 = "DPTImageProcessor", {"height": 70, "width": 70}
 PATCHES = {"keep_aspect_ratio": True, "ensure_multiple_of": 14}
 # Each network, its image processor and the options of that, as in the published folders but for the sizes.
@@ -104,14 +167,21 @@ NETWORKS: dict[str, tuple[Callable[[], Any], str, dict[str, Any]]] = {
     "depth_anything": (depth_anything, DPT, {"size": SQUARE_70, **PATCHES, **IMAGENET}),
     "metric_depth_anything": (metric_depth_anything, DPT, {"size": SQUARE_70, **PATCHES, **IMAGENET}),
     "midas_vit": (midas_vit, DPT, {"size": {"height": 64, "width": 64}, "resample": 2}),
+    "midas_hybrid": (midas_hybrid, DPT, {"size": {"height": 64, "width": 64}, "resample": 2}),
     "midas_beit": (midas_beit, DPT, {"size": {"height": 64, "width": 64}, "keep_aspect_ratio": True, "ensure_multiple_of": 32}),
     "midas_swin": (midas_swin, DPT, {"size": {"height": 64, "width": 64}, "keep_aspect_ratio": True, "ensure_multiple_of": 32}),
-    "dinov2_dpt": (dinov2_dpt, DPT, {"do_resize": False, "do_pad": True, "size_divisor": 14, **IMAGENET}),
+    "dinov2_dpt": (dinov2_dpt, DPT, {"do_resize": False, "do_pad": True, "size_divisor": 14, **IMAGENET_GREY_LEVELS}),
     "glpn": (glpn, "GLPNImageProcessor", {"size_divisor": 32}),
     "zoe": (zoe, "ZoeDepthImageProcessor", {"size": {"height": 64, "width": 96}, "ensure_multiple_of": 32}),
 }
 if hasattr(hf, "DepthProConfig"):  # since transformers 4.49
     NETWORKS["depth_pro"] = (depth_pro, "DepthProImageProcessor", {"size": {"height": 56, "width": 56}})
+if hasattr(hf, "Tipsv2DptConfig"):
+    NETWORKS["tipsv2"] = (tipsv2, "Tipsv2DptImageProcessor", {"size": SQUARE_70, "resample": 2, "do_normalize": False})
+if hasattr(hf, "CHMv2Config"):
+    NETWORKS["chmv2"] = (chmv2, "CHMv2ImageProcessor", {})
+if hasattr(hf, "PromptDepthAnythingConfig"):  # since transformers 4.50
+    NETWORKS["prompt_depth_anything"] = (prompt_depth_anything, "PromptDepthAnythingImageProcessor", {"size": SQUARE_70, **PATCHES})
 
 
 def save_small_network(kind: str, folder: Path, seed: int = 0) -> Path:

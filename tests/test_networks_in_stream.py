@@ -1,21 +1,25 @@
 import json
 import os
+import shutil
 import subprocess
 import sys
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
-from tests.scenes import grey_fill, layered_depth, photo_tar
-from zsdata import ZeroStereoStream, load_depth
+from tests.scenes import grey_fill, layered_depth, photo, photo_tar, png, write_tar
+from zsdata import QualityGate, ZeroStereoStream, load_depth
 from zsdata.licences import NonCommercialModel
 from zsdata.synthesis.depth import DepthNetwork
+from zsdata.synthesis.depth.pretrained import PretrainedDepth
 from zsdata.synthesis.inpaint import DiffusionNetwork
 from zsdata.synthesis.micro_batch import GIB, WarmUp
 
 small = pytest.importorskip("tests.small_depth_networks")
 
 SIZE = (64, 96)
+ALL_PASS = QualityGate(max_hole_share=1, min_visible_share=0, min_depth_range=0, min_flip_consistency=0)
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +53,21 @@ def test_a_network_gives_the_same_labels_in_the_workers_and_on_the_device(folder
                 assert (mask != other_mask).float().mean() <= 0.001
 
 
+@pytest.mark.parametrize("batch_size", [2, 3, 8])
+@pytest.mark.parametrize("workers", [0, 1])
+def test_the_views_of_a_photo_cost_one_estimate_on_the_device_whatever_batches_cut_through_them(
+    folder, tar, monkeypatch, batch_size, workers
+):
+    images, run = [], PretrainedDepth._run
+    monkeypatch.setattr(PretrainedDepth, "_run", lambda self, inputs: images.append(len(inputs)) or run(self, inputs))
+    stream = ZeroStereoStream(
+        tar, size=SIZE, depth=folder, inpaint=grey_fill, views_per_image=8, depth_placement="device", quality=ALL_PASS
+    )
+    with stream.loader(batch_size, num_workers=workers) as loader:
+        assert len(list(loader)) == 6 * 8 // batch_size
+    assert sum(images) == 6 * 2  # photos, each with its mirror image
+
+
 def test_the_resolution_reaches_the_network(folder, tar):
     coarse, fine = (next(iter(ZeroStereoStream(tar, size=SIZE, depth=folder, depth_resolution=side))) for side in (42, 140))
     assert not torch.equal(coarse.disparity, fine.disparity)
@@ -56,6 +75,45 @@ def test_the_resolution_reaches_the_network(folder, tar):
     assert torch.equal(next(iter(whole)).disparity, coarse.disparity)
     with pytest.raises(ValueError, match="depth_resolution belongs to a network"):
         ZeroStereoStream(tar, depth=layered_depth, depth_resolution=42)
+
+
+@pytest.mark.parametrize("placement", ["worker", "device"])
+@pytest.mark.parametrize("loaded", [False, True])
+def test_a_strip_is_counted_before_a_network_sees_it(folder, tmp_path, placement, loaded):
+    sizes = [(64, 256), (64, 257), (400, 64), (64, 64)]
+    tar = write_tar(tmp_path / "strips.tar", {f"{i}.png": png(photo(i, *size)) for i, size in enumerate(sizes)})
+    depth = load_depth(folder) if loaded else folder
+    with ZeroStereoStream(tar, size=SIZE, depth=depth, inpaint=grey_fill, depth_placement=placement).loader(1, num_workers=1) as loader:
+        used = {sample["key"] for batch in loader for sample in batch.meta}
+        assert used == {"0", "3"}
+        assert loader.stats()["rejected"] == {"too long for the depth network": 2}
+
+
+@pytest.mark.parametrize("placement", ["worker", "device"])
+def test_depth_that_is_not_finite_names_the_sample_and_the_cure(folder, tar, tmp_path, placement):
+    spoilt = shutil.copytree(folder, tmp_path / "spoilt")
+    weights = load_file(spoilt / "model.safetensors")
+    save_file(
+        {**weights, "head.conv1.bias": weights["head.conv1.bias"] * torch.nan}, spoilt / "model.safetensors", metadata={"format": "pt"}
+    )
+    stream = ZeroStereoStream(tar, size=SIZE, depth=spoilt, inpaint=grey_fill, depth_placement=placement)
+    message = r"sample \d of epoch 0 \(.*photos\.tar\) failed: inverse depth must be finite.*float32"
+    with pytest.raises(RuntimeError, match=message), stream.loader(3) as loader:
+        next(iter(loader))
+
+
+def test_a_network_that_fails_on_the_device_names_its_photos(folder, tar, monkeypatch):
+    stream = ZeroStereoStream(tar, size=SIZE, depth=folder, inpaint=grey_fill, depth_placement="device")
+    with stream.loader(3) as loader:
+        monkeypatch.setattr(PretrainedDepth, "_run", lambda self, inputs: inputs.nonsense)
+        with pytest.raises(RuntimeError, match=r'"00000\d" in .*photos\.tar, "00000\d" in .*photos\.tar, "00000\d" in .*photos\.tar$'):
+            next(iter(loader))
+
+
+def test_a_network_that_takes_squares_sees_strips(tmp_path):
+    square = small.save_small_network("midas_vit", tmp_path / "midas_vit")
+    tar = write_tar(tmp_path / "strip.tar", {"strip.png": png(photo(0, 64, 400))})
+    assert len(list(ZeroStereoStream(tar, size=SIZE, depth=square, inpaint=grey_fill, quality=ALL_PASS))) == 1
 
 
 def test_a_network_that_is_nowhere_is_an_error_at_once_and_in_words(tar, tmp_path):
@@ -103,11 +161,33 @@ def test_auto_keeps_depth_in_the_workers_where_the_loader_has_no_gpu(folder, tar
         assert "prepare" not in loader.stats()["seconds"]
 
 
+class OnGpu:
+    """An estimator that says it is on a GPU, as a network does that was loaded there; counts its calls in this process."""
+
+    device, calls = torch.device("cuda", 0), 0
+
+    def __call__(self, images):
+        self.calls += 1
+        return layered_depth(images)
+
+
+def test_a_network_that_was_loaded_onto_a_gpu_stays_out_of_the_workers(tar):
+    depth = OnGpu()
+    with ZeroStereoStream(tar, size=SIZE, depth=depth, inpaint=grey_fill).loader(3, num_workers=1) as loader:
+        next(iter(loader))
+    assert depth.calls > 0
+    with pytest.raises(
+        ValueError, match=r'the network that was given is on cuda:0; load it onto the CPU \(load_depth\(\.\.\., device="cpu"\)\)'
+    ):
+        ZeroStereoStream(tar, size=SIZE, depth=depth, depth_placement="worker")
+
+
 def test_options_that_change_no_picture_do_not_change_the_place(folder, tar):
     state = ZeroStereoStream(tar, size=SIZE, depth=DepthNetwork(str(folder), micro_batch=2)).state_dict()
-    ZeroStereoStream(tar, size=SIZE, depth=DepthNetwork(str(folder), micro_batch=16)).load_state_dict(state)
-    with pytest.raises(ValueError, match="configuration"):
-        ZeroStereoStream(tar, size=SIZE, depth=DepthNetwork(str(folder), resolution=42)).load_state_dict(state)
+    ZeroStereoStream(tar, size=SIZE, depth=DepthNetwork(str(folder), dtype="float32", micro_batch=16)).load_state_dict(state)
+    for changed in ({"resolution": 42}, {"dtype": "bf16"}):
+        with pytest.raises(ValueError, match="configuration"):
+            ZeroStereoStream(tar, size=SIZE, depth=DepthNetwork(str(folder), **changed)).load_state_dict(state)
 
 
 @pytest.mark.parametrize(("options", "loader", "samples"), [({}, {}, 8), ({"reuse": 3}, {}, 4), ({}, {"micro_batch": 2}, 2)])

@@ -292,6 +292,9 @@ def test_a_depth_estimator_that_fails_names_the_sample(tar):
         next(iter(open_stream(tar, depth=broken)))
     with pytest.raises(RuntimeError, match=r"sample 0 .* must return its maps on cpu, where the photos are; got meta"):
         next(iter(open_stream(tar, depth=lambda images: images[:, :1].to("meta"))))
+    for returned in (None, {}, np.zeros(3)):
+        with pytest.raises(RuntimeError, match=rf"sample 0 .* must return a tensor, .*; got {type(returned).__name__}"):
+            next(iter(open_stream(tar, depth=lambda images, returned=returned: returned)))
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,8 @@ Where depth is the device's work too, it first makes the pairs: the same functio
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -32,21 +32,26 @@ class Synthesis:
     depth: DepthEstimator | None  # None: every draft has its depth
     recipe: Recipe
     worker: Worker  # of the same recipe: draws what stands in for a pair that the quality gate refuses
+    _last: dict[tuple[str, str], DepthMaps] = field(default_factory=dict)  # of the last photo: its next view may begin the next batch
 
     def __call__(self, drafts: Drafts, device: torch.device, meter: Meter) -> Prepared:
-        """The pairs of a batch of drafts, on the device; a photo's depth is estimated once, however many views of it are in the batch."""
+        """The pairs of a batch of drafts, on the device; a photo's depth is estimated once, however many views follow one another."""
         drawn = list(drafts.drafts)
         made: dict[int, Prepared] = {}
+        known = dict(self._last)
         while len(made) < len(drawn):
             missing = {place: draft for place, draft in enumerate(drawn) if place not in made}
             with meter.stage("depth"):
-                known = self._estimate({_photo(draft): draft for draft in missing.values() if draft.depth is None}, device)
+                unknown = {_photo(draft): draft for draft in missing.values() if draft.depth is None and _photo(draft) not in known}
+                known.update(self._estimate(unknown, device))
             for place, draft in missing.items():
                 depth = draft.depth if draft.depth is not None else known[_photo(draft)]
                 try:
                     made[place] = self._make(draft, depth, device, meter)
                 except BadPhoto as fault:
                     drawn[place] = self.worker.instead(draft, fault.reason)
+        self._last.clear()
+        self._last.update({photo: depth for photo, depth in known.items() if photo == _photo(drawn[-1])})
         pairs = Prepared.stack([made[place] for place in range(len(drawn))])
         meta = [{**pairs.meta[row], "index": sample["index"]} for row, sample in zip(drafts.rows, drafts.meta, strict=True)]
         rejected = [reject for draft in drawn for reject in draft.rejected]
@@ -66,12 +71,14 @@ class Synthesis:
         config = self.recipe.synthesis
         photos = [draft.photo.to(device, non_blocking=True) for draft in drafts.values() if draft.photo is not None]
         if as_network(self.recipe.depth) is not None:
-            found = predict_depth(self.depth, photos, [tuple(draft.meta["photo_size"]) for draft in drafts.values()], config)
+            with _naming_photos(drafts):
+                maps = predict_depth(self.depth, photos, [tuple(draft.meta["photo_size"]) for draft in drafts.values()], config)
         else:
-            found = []
-            for photo, draft in zip(photos, drafts.values(), strict=True):
-                with naming(draft.meta):
-                    found.append(estimate_depth(self.depth, photo.float(), config))
+            maps = (estimate_depth(self.depth, photo.float(), config) for photo in photos)
+        found = []
+        for draft in drafts.values():
+            with naming(draft.meta):
+                found.append(next(maps))
         if self.recipe.depth_cache is not None:
             for draft, depth in zip(drafts.values(), found, strict=True):
                 store_depth(self.recipe.depth_cache, draft.digest, depth)
@@ -80,6 +87,18 @@ class Synthesis:
 
 def _photo(draft: Draft) -> tuple[str, str]:
     return draft.meta["shard"], draft.meta["key"]
+
+
+@contextmanager
+def _naming_photos(photos: Iterable[tuple[str, str]]) -> Iterator[None]:
+    """Errors of work on many photos at once say which they are. One photo that memory does not hold is the device's affair."""
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:
+        listed = ", ".join(f'"{key}" in {shard}' for shard, key in photos)
+        raise RuntimeError(f"the depth network failed: {error} The photos that it was given: {listed}") from error
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from zsdata.quality import QualityGate
 from zsdata.sample import StereoBatch
 from zsdata.source.shard_cache import ShardCache
 from zsdata.sources import Schedule
-from zsdata.synthesis.depth import DepthEstimator, DepthNetwork, as_network, load_depth
+from zsdata.synthesis.depth import DepthEstimator, DepthNetwork, as_network, depth_name, load_depth
 from zsdata.synthesis.depth.builtin import warn_once
 from zsdata.synthesis.depth.cache import DepthCache
 from zsdata.synthesis.depth.identity import depth_identity, pinned
@@ -79,8 +79,8 @@ class ZeroStereoStream(IterableDataset):
         reuse: samples that share one pair, one after another, each with an augmentation of its own: for inpainters that are slower than
             the training. A multiple of it makes the best batch size.
         depth_placement: "worker": depth is estimated by the loader's workers, on the CPU; "device": workers stop after decoding, and the
-            loader estimates and warps on its device; "auto": on the device for a network whose loader has a GPU, in the workers otherwise.
-            Plain iteration and `replay` do everything on the CPU.
+            loader estimates and warps on its device; "auto": on the device for a network whose loader has a GPU, or that was loaded onto
+            one, in the workers otherwise. Plain iteration and `replay` do everything on the CPU.
         depth_resolution: the short side of a depth network's input in pixels, or "native", the photo's own size; None is the network's own.
         commercial_safe: refuses models that are known to be for non-commercial use alone. Of stored depth no model is known.
         depth_cache: a folder that keeps the depth of every photo, so that a slow estimator is paid once per photo and not once per epoch.
@@ -134,10 +134,17 @@ class ZeroStereoStream(IterableDataset):
                 raise ValueError(f"{name} is an integer, 1 or more and at most {MOST_SAMPLES_OF_ONE:,}; got {count!r}")
         if depth_placement not in DEPTH_PLACEMENTS:
             raise ValueError(f"depth_placement is one of {', '.join(DEPTH_PLACEMENTS)}; got {depth_placement!r}")
+        place = getattr(depth, "device", None)  # of a network that is loaded already
+        self._depth_elsewhere = isinstance(place, torch.device) and place.type != "cpu"
+        if depth_placement == "worker" and self._depth_elsewhere:
+            raise ValueError(
+                f'depth_placement="worker" estimates depth on the CPU, and the network that was given is on {place}; load it onto the CPU '
+                '(load_depth(..., device="cpu")), give its name instead, or say depth_placement="device"'
+            )
         self._depth_placement = depth_placement
         self._views_per_image = views_per_image
         self._samples_per_photo = views_per_image * reuse
-        depth = depth if callable(depth) or isinstance(depth, DepthNetwork) else os.fspath(depth)
+        depth = depth if callable(depth) or isinstance(depth, DepthNetwork) else depth_name(depth)
         self._schedule = Schedule(sources, seed, epoch_size, self._samples_per_photo, stored_depth=depth == STORED)
         self._revision = 0
         self._told_problems = 0
@@ -271,7 +278,7 @@ class ZeroStereoStream(IterableDataset):
         device = torch.device(device)
         on_device = self._depth_placement == "device"
         if self._depth_placement == "auto":
-            on_device = device.type != "cpu" and as_network(self._recipe.depth) is not None
+            on_device = self._depth_elsewhere or (device.type != "cpu" and as_network(self._recipe.depth) is not None)
         finisher = self._finisher(device, micro_batch, on_device)
         if device.type != "cpu" and self._recipe.size is not None:
             ready = [said for said in finisher.warm_up(self._recipe.size, batch_size) if isinstance(said, WarmUp)]

@@ -83,6 +83,7 @@ class Worker:
     def __init__(self, recipe: Recipe) -> None:
         self._recipe = recipe
         self._depth: DepthEstimator | None = None
+        self._preprocessing: Preprocessing | None = recipe.preprocessing or getattr(recipe.depth, "preprocessing", None)
         self._last: tuple[tuple[str, int], _Photo] | None = None  # the photo whose next view comes next
         self._last_pair: tuple[tuple[SourceSet, int, int], Prepared | Draft] | None = None
 
@@ -202,6 +203,9 @@ class Worker:
             data = manifest.read(choice.member, self._recipe.shard_cache)
         with meter.stage("decode"):
             photo = _Photo(data, stored_depth)
+        refused = None if self._preprocessing is None else self._preprocessing.refuses(*photo.size)
+        if refused is not None:
+            raise BadPhoto(refused)
         self._last = (key, photo) if sources.plan.samples_per_photo > 1 else None
         return photo
 

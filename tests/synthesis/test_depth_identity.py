@@ -85,7 +85,7 @@ def hub_cache(tmp_path, monkeypatch):
 def test_a_hub_id_is_the_commit_in_the_local_cache(hub_cache):
     in_hub_cache(hub_cache, "owner/network", COMMITS[0])
     in_hub_cache(hub_cache, "owner/other", COMMITS[0])
-    assert depth_identity("owner/network") == f"hub owner/network {COMMITS[0]} 2"
+    assert depth_identity("owner/network") == f"hub owner/network {COMMITS[0]} 3"
     assert depth_identity("owner/other") != depth_identity("owner/network")
     in_hub_cache(hub_cache, "owner/network", COMMITS[1])  # main went on; the old snapshot is still there
     assert hub_commit("owner/network") == COMMITS[1] and COMMITS[1] in depth_identity("owner/network")

@@ -3,10 +3,12 @@ import logging
 import math
 import os
 import pickle
+import re
 import shutil
 import subprocess
 import sys
 import types
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,8 @@ from safetensors.torch import load_file, save_file
 
 from tests.scenes import grey_fill, photo, photo_tar
 from zsdata import ZeroStereoStream, load_depth
+from zsdata.synthesis.confidence import normalize_inverse_depth
+from zsdata.synthesis.depth import pretrained
 from zsdata.synthesis.depth.identity import depth_identity
 from zsdata.synthesis.depth.options import DepthNetwork
 from zsdata.synthesis.depth.pretrained import SMALLEST_DEPTH_M, _predicts, load_preprocessing
@@ -25,6 +29,7 @@ transformers = pytest.importorskip("transformers")
 small = pytest.importorskip("tests.small_depth_networks")
 
 PREDICT_DEPTH = {"metric_depth_anything", "dinov2_dpt", "glpn", "zoe"}
+HALVES = ((0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
 PIL_PROCESSORS = {"DPTImageProcessor", "GLPNImageProcessor", "ZoeDepthImageProcessor"}  # the others need torchvision
 
 
@@ -57,10 +62,17 @@ def change(folder, name, **values):
     path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
 
 
+def inverted(metres):
+    """1 / depth, where the nearest thousandth of the pixels is no nearer than the next one."""
+    sorted_metres = metres.flatten().sort().values
+    return 1 / metres.clamp(min=max(SMALLEST_DEPTH_M, float(sorted_metres[math.ceil(len(sorted_metres) / 1000)])))
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bf16"])
 @pytest.mark.parametrize("kind", small.NETWORKS)
-def test_every_kind_of_network_gives_a_finite_map_of_the_photos_size(folders, kind):
+def test_every_kind_of_network_gives_a_finite_map_of_the_photos_size(folders, kind, dtype):
     images = photos(2)
-    depth = load_depth(folders(kind))(images)
+    depth = load_depth(folders(kind), dtype=dtype)(images)
     assert depth.shape == (2, 1, 90, 131) and depth.dtype == torch.float32
     assert torch.isfinite(depth).all() and depth.std() > 0 and not torch.equal(depth[0], depth[1])
 
@@ -71,6 +83,7 @@ def test_every_kind_of_network_gives_a_finite_map_of_the_photos_size(folders, ki
         ("depth_anything", 90, 131),
         ("metric_depth_anything", 160, 100),
         ("midas_vit", 90, 131),
+        ("midas_hybrid", 90, 131),
         ("midas_beit", 90, 131),
         ("midas_swin", 90, 131),
         ("dinov2_dpt", 84, 126),  # where the size is right already: transformers pads or cuts where this resizes
@@ -86,12 +99,13 @@ def test_the_result_is_that_of_transformers_own_processor_and_model(folders, kin
     depth = load_depth(path)
     pixels = processor(images=[image], return_tensors="pt")["pixel_values"].float()
     tensor = torch.from_numpy(image).permute(2, 0, 1)[None]
-    levels = (pixels - depth.preprocessing.normalise(depth.prepare(tensor))) * torch.tensor(depth.preprocessing.std).view(3, 1, 1) * 255
+    difference = pixels - depth.preprocessing.normalise(depth.prepare(tensor))
+    levels = difference * torch.tensor(depth.preprocessing.std).view(3, 1, 1) / depth.preprocessing.rescale
     assert levels.abs().max() < 1.001  # PIL rounds a few pixels to the neighbouring grey level; ZoeDepth's does not round
     assert levels.abs().mean() < (0.3 if kind == "zoe" else 0.01)
     with torch.no_grad():
         predicted = network(pixel_values=pixels).predicted_depth
-    inverse = 1 / predicted.clamp(min=SMALLEST_DEPTH_M) if kind in PREDICT_DEPTH else predicted
+    inverse = inverted(predicted) if kind in PREDICT_DEPTH else predicted
     rows, columns = (int(math.sqrt(side / 2) * 3) if kind == "zoe" else 0 for side in (height, width))
     expected = F.interpolate(inverse[None], (height + 2 * rows, width + 2 * columns), mode="bilinear")
     expected = expected[..., rows : rows + height, columns : columns + width]
@@ -110,6 +124,26 @@ def test_depth_pro_is_given_its_square_and_not_inverted(folders):
         predicted = network(pixel_values=F.interpolate(images, (56, 56), mode="bilinear") / 127.5 - 1).predicted_depth
     expected = F.interpolate(predicted[None], (90, 131), mode="bilinear")
     assert (load_depth(path)(images) - expected).abs().max() < 0.02 * (expected.max() - expected.min())
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "mean", "std"),
+    [("chmv2", (96, 128), (0.42, 0.411, 0.296), (0.213, 0.156, 0.143)), ("prompt_depth_anything", (70, 98), *HALVES)],
+)
+def test_newer_networks_see_what_their_image_processors_do_by_default(folders, kind, size, mean, std):
+    if kind not in small.NETWORKS:
+        pytest.skip("needs a newer transformers")
+    preprocessing = load_preprocessing(DepthNetwork(str(folders(kind))))
+    assert preprocessing.input_size(90, 131) == size
+    assert (preprocessing.mean, preprocessing.std, preprocessing.mode) == (mean, std, "bicubic")
+
+
+@pytest.mark.parametrize(("options", "factor"), [({}, 1 / 255), ({"rescale_factor": 1 / 127.5}, 1 / 127.5), ({"do_rescale": False}, 1.0)])
+def test_grey_levels_are_rescaled_as_the_folder_says(copy, options, factor):
+    change(copy, "preprocessor_config.json", image_mean=[1.0, 2.0, 3.0], image_std=[0.5, 1.0, 2.0], **options)
+    made = load_preprocessing(DepthNetwork(str(copy))).normalise(torch.full((1, 3, 1, 1), 204, dtype=torch.uint8))
+    expected = [(204 * factor - mean) / std for mean, std in ((1.0, 0.5), (2.0, 1.0), (3.0, 2.0))]
+    assert torch.allclose(made.flatten(), torch.tensor(expected))
 
 
 def test_the_network_sees_what_its_folder_says(folder, monkeypatch):
@@ -146,10 +180,12 @@ def test_networks_that_take_squares_get_squares(folders):
         load_depth(folders("midas_vit"), resolution="native")
 
 
-@needs_depth_pro
-def test_depth_pro_takes_one_size(folders):
-    with pytest.raises(ValueError, match="takes 56x56 pixels and nothing else; got resolution=112"):
-        load_depth(folders("depth_pro"), resolution=112)
+@pytest.mark.parametrize(("kind", "side"), [pytest.param("depth_pro", 56, marks=needs_depth_pro), ("midas_hybrid", 64)])
+@pytest.mark.parametrize("resolution", [112, "native"])
+def test_networks_that_take_one_size_are_given_no_other(folders, kind, side, resolution):
+    with pytest.raises(ValueError, match=f"takes {side}x{side} pixels and nothing else; got resolution={resolution!r}"):
+        load_preprocessing(DepthNetwork(str(folders(kind)), resolution))
+    assert load_preprocessing(DepthNetwork(str(folders(kind)), side)).input_size(90, 131) == (side, side)
 
 
 @pytest.mark.parametrize("kind", small.NETWORKS)
@@ -243,6 +279,15 @@ def test_half_precision_keeps_fine_steps(folder):
     assert len(coarse.unique()) < 1000 < len(steps.unique())
 
 
+@pytest.mark.parametrize("kind", small.NETWORKS)
+def test_half_precision_keeps_as_many_values_as_float32_in_every_kind_of_network(folders, kind):
+    exact, half = (load_depth(folders(kind), dtype=dtype) for dtype in ("float32", "bf16"))
+    inputs = exact.prepare(photos(1))
+    size = tuple(inputs.shape[-2:])
+    exact_values, half_values = (len(depth.predict([inputs], [size])[0].unique()) for depth in (exact, half))
+    assert half_values > 0.9 * exact_values
+
+
 def test_an_autocast_around_it_changes_nothing(folder):
     depth = load_depth(folder)
     with torch.autocast("cpu", torch.bfloat16):
@@ -288,7 +333,7 @@ def test_a_revision_is_found_in_the_hub_cache_without_network(folder, tmp_path):
         "from zsdata.synthesis.depth.options import DepthNetwork\n"
         'network = DepthNetwork("somebody/depth", "native", revision="v1")\n'
         "assert zsdata.load_depth(network)(torch.rand(1, 3, 28, 42) * 255).shape == (1, 1, 28, 42)\n"
-        f'assert depth_identity(network) == "hub somebody/depth {"0" * 40} 2 resolution=native"\n'
+        f'assert depth_identity(network) == "hub somebody/depth {"0" * 40} 3 resolution=native"\n'
         "try:\n"
         '    zsdata.load_depth("somebody/depth")\n'
         "except OSError as error:\n"
@@ -301,10 +346,33 @@ def test_a_revision_is_found_in_the_hub_cache_without_network(folder, tmp_path):
     assert result.returncode == 0, result.stderr
 
 
+def test_a_folder_has_no_revisions(folder, tmp_path):
+    tar = photo_tar(tmp_path / "photos.tar", 1)
+    message = f"depth=\"{folder}\" is a folder, which has no revisions; got revision='v1'. Leave revision out"
+    for use in (load_depth, lambda depth: ZeroStereoStream(tar, depth=depth)):
+        with pytest.raises(ValueError, match=message):
+            use(DepthNetwork(str(folder), revision="v1"))
+
+
 def test_the_cache_tells_options_apart(folder):
     plain, native, half = (depth_identity(DepthNetwork(str(folder), **o)) for o in ({}, {"resolution": "native"}, {"dtype": "bf16"}))
     assert plain == depth_identity(folder) and len({plain, native, half}) == 3
-    assert depth_identity(DepthNetwork(str(folder), compile=True, micro_batch=2)) == plain
+    assert depth_identity(DepthNetwork(str(folder), dtype="float32", compile=True, micro_batch=2)) == plain
+
+
+def test_a_network_computes_in_whole_float32_unless_another_format_is_asked_for(folder, monkeypatch):
+    """Wherever it runs: labels from a GPU are those from the workers and of `replay`."""
+    kept_whole, networks = [], [load_depth(folder), load_depth(folder, dtype="bf16")]
+
+    @contextmanager
+    def recorded(device):
+        kept_whole.append(device)
+        yield
+
+    monkeypatch.setattr(pretrained, "without_tf32", recorded)
+    for depth in networks:
+        depth(photos(1))
+    assert [depth.dtype for depth in networks] == [torch.float32, torch.bfloat16] and kept_whole == [torch.device("cpu")]
 
 
 def test_what_is_predicted_is_told_by_the_configuration_or_by_the_user(folder):
@@ -314,7 +382,149 @@ def test_what_is_predicted_is_told_by_the_configuration_or_by_the_user(folder):
     images = photos(1, 70, 98)
     near, deep = (load_depth(folder, predicts=said)(images) for said in ("inverse depth", "depth"))
     assert torch.equal(near, load_depth(folder)(images))
-    assert torch.allclose(deep, 1 / near.clamp(min=SMALLEST_DEPTH_M))
+    assert torch.allclose(deep, inverted(near))
+
+
+def test_one_pixel_at_no_distance_changes_nothing_else(folder):
+    depth, metres = load_depth(folder, predicts="depth"), torch.linspace(1, 10, 96 * 128).view(1, 96, 128)
+    spoilt = metres.clone()
+    spoilt[0, 50, 60] = 0
+    made = []
+    for seen in (metres, spoilt):
+        depth._network = lambda pixel_values, seen=seen: types.SimpleNamespace(predicted_depth=seen)
+        made.append(normalize_inverse_depth(depth(torch.zeros(1, 3, 96, 128))))
+    different = (made[0] - made[1]).abs() > 0.002
+    assert different.nonzero().tolist() == [[0, 0, 50, 60]] and made[1][0, 0, 50, 60] == 1
+
+
+def test_zoe_depth_without_padding_still_aligns_corners(folders, tmp_path):
+    path = shutil.copytree(folders("zoe"), tmp_path / "zoe")
+    change(path, "preprocessor_config.json", do_pad=False)
+    image = photos(1, 90, 131)
+    expected = F.interpolate(image, (64, 96), mode="bilinear", align_corners=True)
+    prepared = load_preprocessing(DepthNetwork(str(path))).prepare(image)
+    assert prepared.shape == expected.shape and (prepared - expected).abs().max() <= 0.5
+
+
+def test_zoe_depth_resized_by_cubic_curves_stays_within_0_and_255(folders, tmp_path):
+    path = shutil.copytree(folders("zoe"), tmp_path / "zoe")
+    change(path, "preprocessor_config.json", resample=3)
+    checks = torch.zeros(1, 3, 32, 32)
+    checks[..., ::3, :] = 255.0
+    padded = F.pad(checks, (12, 12, 12, 12), mode="reflect")
+    expected = F.interpolate(padded, (64, 64), mode="bicubic", align_corners=True)
+    assert expected.min() < -10
+    prepared = load_preprocessing(DepthNetwork(str(path))).prepare(checks)
+    assert (prepared - expected.clamp(0, 255)).abs().max() <= 0.5
+
+
+@pytest.mark.parametrize(
+    ("kind", "predicts"),
+    [
+        ("depth_anything", "inverse depth"),
+        ("metric_depth_anything", "depth"),
+        ("midas_vit", "inverse depth"),
+        ("midas_hybrid", "inverse depth"),
+        ("dinov2_dpt", "depth"),
+        ("glpn", "depth"),
+        ("zoe", "depth"),
+        ("depth_pro", "inverse depth"),
+        ("tipsv2", "depth"),
+        ("chmv2", "inverse depth"),  # the height of trees from above
+        ("prompt_depth_anything", "depth"),
+    ],
+)
+def test_what_each_kind_of_network_predicts_is_known(folders, kind, predicts):
+    if kind not in small.NETWORKS:
+        pytest.skip("needs a newer transformers")
+    assert torch.equal(load_depth(folders(kind))(photos(1)), load_depth(folders(kind), predicts=predicts)(photos(1)))
+
+
+def of_another_class(folder):
+    config = transformers.ViTConfig(hidden_size=8, num_hidden_layers=1, num_attention_heads=1, intermediate_size=8, image_size=16)
+    transformers.ViTForImageClassification(config).save_pretrained(folder)
+
+
+def in_two_files(folder):
+    weights = load_file(folder / "model.safetensors")
+    (folder / "model.safetensors").unlink()
+    save_file(weights, folder / "model-00001-of-00002.safetensors", metadata={"format": "pt"})
+    parts = {**dict.fromkeys(weights, "model-00001-of-00002.safetensors"), "head.conv1.weight": "model-00002-of-00002.safetensors"}
+    (folder / "model.safetensors.index.json").write_text(json.dumps({"weight_map": parts}))
+
+
+POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:abc\nsize 99\n"
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (
+            lambda folder: (folder / "model.safetensors").unlink(),
+            r"holds no weights: model\.safetensors is missing; download the folder again",
+        ),
+        (in_two_files, r"lacks model-00002-of-00002\.safetensors, which model\.safetensors\.index\.json names; download it again"),
+        (
+            lambda folder: (folder / "model.safetensors").write_text(POINTER),
+            "is a Git LFS pointer, not the weights; fetch them: git lfs pull",
+        ),
+        (lambda folder: (folder / "model.safetensors").write_bytes(b""), r"model\.safetensors is empty; download it again"),
+        (
+            lambda folder: os.truncate(folder / "model.safetensors", 100_000),
+            r"is no whole safetensors file \(100,000 bytes: .*\); download it",
+        ),
+        (lambda folder: (folder / "config.json").write_text("{oops"), r"cannot be loaded: .*config\.json"),
+        (lambda folder: (folder / "preprocessor_config.json").unlink(), r"cannot be loaded: .*preprocessor_config\.json"),
+        (
+            lambda folder: (folder / "preprocessor_config.json").write_text("{oops"),
+            r"its preprocessor_config\.json is no JSON .*; download it",
+        ),
+        (lambda folder: (folder / "preprocessor_config.json").write_text("[]"), r"holds options by name; got \[\]\. Download it again"),
+        (of_another_class, r"is no depth network: its config\.json says vit ViTForImageClassification; name one that"),
+    ],
+)
+def test_a_folder_that_cannot_work_is_refused_as_the_stream_is_made(copy, tmp_path, spoil, message):
+    tar = photo_tar(tmp_path / "photos.tar", 1)
+    spoil(copy)
+    with pytest.raises((OSError, ValueError), match=f'^depth="{copy}".*{message}'):
+        ZeroStereoStream(tar, depth=copy)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "wanted"),
+    [
+        ("size", {"longest_edge": 70}, "a number of pixels, or height and width"),
+        ("size", "big", "a number of pixels, or height and width"),
+        ("image_mean", 0.5, "three numbers"),
+        ("image_mean", [0.5], "three numbers"),
+        ("image_std", [1, 0, 1], "three numbers above 0"),
+        ("rescale_factor", "1/255", "a number above 0"),
+        ("do_rescale", "no", "true or false"),
+        ("resample", [3], "a whole number"),
+    ],
+)
+def test_a_preprocessing_that_makes_no_sense_is_named(copy, option, value, wanted):
+    change(copy, "preprocessor_config.json", **{option: value})
+    with pytest.raises(
+        ValueError, match=rf'^depth="{copy}": {option} in its .* is {wanted}; got {re.escape(repr(value))}\. Download it again'
+    ):
+        load_preprocessing(DepthNetwork(str(copy)))
+
+
+def test_weights_of_another_shape_are_named(copy):
+    change(copy, "config.json", head_hidden_size=16)
+    with pytest.raises(
+        ValueError, match=r'^depth=".*" has 3 weights of another shape than its config\.json says, "head\.conv2\.bias" for one'
+    ):
+        load_depth(copy)
+
+
+@pytest.mark.parametrize("depth", [None, 3, ["a"], b"builtin"])
+def test_what_is_no_depth_is_said(depth, tmp_path):
+    tar = photo_tar(tmp_path / "photos.tar", 1)
+    for use in (load_depth, lambda depth: ZeroStereoStream(tar, depth=depth)):
+        with pytest.raises(TypeError, match=rf'^depth is "builtin", "stored", a Hub id, .*; got {re.escape(repr(depth))}$'):
+            use(depth)
 
 
 def test_missing_weights_are_named(copy):
@@ -346,7 +556,7 @@ def test_weights_that_nothing_uses_may_be_missing(copy):
 
 def test_an_unknown_image_processor_is_named(copy):
     change(copy, "preprocessor_config.json", image_processor_type="NewImageProcessor")
-    with pytest.raises(ValueError, match="wants its photos prepared by NewImageProcessor; known are those of DPT, DepthPro"):
+    with pytest.raises(ValueError, match="wants its photos prepared by NewImageProcessor; known are those of CHMv2, DPT, DepthPro"):
         load_depth(copy)
     change(copy, "preprocessor_config.json", image_processor_type="DPTImageProcessor", resample=1)
     with pytest.raises(ValueError, match="resizes photos by method 1"):

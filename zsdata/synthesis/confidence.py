@@ -22,7 +22,10 @@ def normalize_inverse_depth(inverse_depth: Tensor) -> Tensor:
     low = inverse_depth.amin((1, 2, 3), keepdim=True)
     extent = inverse_depth.amax((1, 2, 3), keepdim=True) - low
     if not torch.isfinite(extent).all():
-        raise ValueError("inverse depth must be finite; got NaN or infinity (does the estimator overflow in half precision?)")
+        raise ValueError(
+            "inverse depth must be finite; got NaN or infinity. An estimator may overflow in half precision, fp16 above all: let it "
+            'compute in float32 (DepthNetwork: dtype="float32")'
+        )
     return ((inverse_depth - low) / torch.where(extent > 0, extent, 1.0)).clamp_(0, 1)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -78,12 +78,12 @@ def estimate_depth(depth: DepthEstimator, photos: Tensor, config: SynthesisConfi
     """
     together = getattr(depth, "with_mirrored", None)
     if not config.flip_confidence:
-        estimate, mirrored = depth(photos), None
-    elif together is not None:
-        estimate, mirrored = together(photos)
+        return _depth_maps(_checked(depth(photos), photos), None)
+    if together is not None:
+        estimate, mirrored = (_checked(maps, photos) for maps in together(photos))
     else:
-        estimate, mirrored = depth(photos), depth(photos.flip(-1)).flip(-1)
-    return _depth_maps(_checked(estimate, photos), None if mirrored is None else _checked(mirrored, photos))
+        estimate, mirrored = _checked(depth(photos), photos), _checked(depth(photos.flip(-1)), photos).flip(-1)
+    return _depth_maps(estimate, mirrored)
 
 
 def given_depth(inverse_depth: Tensor) -> DepthMaps:
@@ -92,17 +92,22 @@ def given_depth(inverse_depth: Tensor) -> DepthMaps:
     return _depth_maps(inverse_depth, None)
 
 
-def predict_depth(depth: Any, prepared: Sequence[Tensor], sizes: Sequence[tuple[int, int]], config: SynthesisConfig) -> list[DepthMaps]:
-    """As `estimate_depth`, of photos of several sizes that an estimator with two halves has prepared elsewhere; one map per photo.
+def predict_depth(depth: Any, prepared: Sequence[Tensor], sizes: Sequence[tuple[int, int]], config: SynthesisConfig) -> Iterator[DepthMaps]:
+    """As `estimate_depth`, of photos of several sizes that an estimator with two halves has prepared elsewhere.
 
     Args:
         depth: an estimator with `predict` and `predict_mirrored`.
         prepared: what its `prepare` made of each photo.
         sizes: (height, width) of the photos.
+
+    Returns:
+        One map per photo. The estimator has done its work when this returns; each map is checked when it is taken.
     """
     if config.flip_confidence:
-        return [_depth_maps(estimate, mirrored) for estimate, mirrored in depth.predict_mirrored(prepared, sizes)]
-    return [_depth_maps(estimate, None) for estimate in depth.predict(prepared, sizes)]
+        estimates: Sequence[tuple[Tensor, Tensor | None]] = depth.predict_mirrored(prepared, sizes)
+    else:
+        estimates = [(estimate, None) for estimate in depth.predict(prepared, sizes)]
+    return (_depth_maps(*maps) for maps in estimates)
 
 
 def _depth_maps(estimate: Tensor, mirrored: Tensor | None) -> DepthMaps:
@@ -151,8 +156,10 @@ def synthesize(photo_view: Tensor, depth: DepthMaps, view: View, scale: float, c
     )
 
 
-def _checked(inverse_depth: Tensor, photos: Tensor) -> Tensor:
+def _checked(inverse_depth: Any, photos: Tensor) -> Tensor:
     expected = (photos.shape[0], 1, *photos.shape[2:])
+    if not isinstance(inverse_depth, Tensor):
+        raise ValueError(f"the depth estimator must return a tensor, [B, 1, H, W] = {list(expected)}; got {type(inverse_depth).__name__}")
     if tuple(inverse_depth.shape) != expected:
         raise ValueError(f"the depth estimator must return [B, 1, H, W] = {list(expected)}; got {list(inverse_depth.shape)}")
     if inverse_depth.device != photos.device:

@@ -26,9 +26,20 @@ def as_network(depth: str | os.PathLike[str] | DepthNetwork | DepthEstimator) ->
     """The network behind the stream's `depth` argument; None for the built-in estimator, stored depth and callables."""
     if isinstance(depth, DepthNetwork):
         return depth
-    if callable(depth) or os.fspath(depth) in ("builtin", STORED):
+    if callable(depth) or depth_name(depth) in ("builtin", STORED):
         return None
-    return DepthNetwork(os.fspath(depth))
+    return DepthNetwork(depth_name(depth))
+
+
+def depth_name(depth: str | os.PathLike[str]) -> str:
+    """The stream's `depth` argument as text, where it is neither a network with options nor a callable.
+
+    Raises:
+        TypeError: it is none of these.
+    """
+    if not isinstance(depth, str | os.PathLike) or not isinstance(os.fspath(depth), str):
+        raise TypeError(f'depth is "builtin", "stored", a Hub id, a folder, a DepthNetwork or a callable; got {depth!r}')
+    return os.fspath(depth)
 
 
 def load_depth(
@@ -43,7 +54,7 @@ def load_depth(
         options: of a network given by name, those of `DepthNetwork`: `resolution`, `revision`, `dtype`, ...
 
     Raises:
-        TypeError: options for something that takes none.
+        TypeError: options for something that takes none, or something that is no `depth`.
         ValueError: "stored", which is no estimator.
     """
     if isinstance(depth, DepthNetwork):
@@ -54,19 +65,19 @@ def load_depth(
         if options:
             raise TypeError(f"a callable estimator takes no options; got {sorted(options)}")
         return depth
-    elif os.fspath(depth) == "builtin":
+    elif depth_name(depth) == "builtin":
         if options:
             raise TypeError(f'depth="builtin" takes no options; got {sorted(options)}')
         from zsdata.synthesis.depth.builtin import BuiltinDepth
 
         return BuiltinDepth()
-    elif os.fspath(depth) == STORED:
+    elif depth_name(depth) == STORED:
         raise ValueError(
             f'depth="{STORED}" is no estimator: it stands for the maps beside the photos (KEY.depth.npy, KEY.depth.png), which '
             "ZeroStereoStream reads; here, name an estimator"
         )
     else:
-        network = DepthNetwork(os.fspath(depth), **options)
+        network = DepthNetwork(depth_name(depth), **options)
     from zsdata.synthesis.depth.pretrained import PretrainedDepth
 
     return PretrainedDepth(network, device)

@@ -13,7 +13,7 @@ from huggingface_hub import try_to_load_from_cache
 from zsdata.synthesis.depth.options import DepthNetwork
 
 BUILTIN_VERSION = 1  # raised when the built-in estimator's output changes
-PRETRAINED_VERSION = 2  # raised when pretrained.py does something else before or after the network
+PRETRAINED_VERSION = 3  # raised when pretrained.py does something else before or after the network
 
 CONFIG_NAMES = ("config.json", "preprocessor_config.json")
 WEIGHT_MARKS = (".safetensors", ".bin")  # part of the name of a file of weights, or of its index
@@ -41,7 +41,11 @@ def depth_identity(depth: str | os.PathLike[str] | DepthNetwork | Callable[..., 
         ValueError: a callable without `cache_name`, or a string that is neither a folder nor a Hub id.
     """
     if isinstance(depth, DepthNetwork):
-        options = {"resolution": depth.resolution, "predicts": depth.predicts, "dtype": depth.dtype}
+        options = {
+            "resolution": depth.resolution,
+            "predicts": depth.predicts,
+            "dtype": None if depth.dtype == DepthNetwork.dtype else depth.dtype,
+        }
         said = "".join(f" {option}={value}" for option, value in options.items() if value is not None)
         return f"{_name_identity(depth.name, depth.revision)}{said}"
     if callable(depth):

@@ -20,10 +20,10 @@ class DepthNetwork:
         name: a Hub id, such as "depth-anything/Depth-Anything-V2-Small-hf", or a local folder.
         resolution: the short side of the network's input in pixels, rounded to whole patches; "native" is the photo's own size; None is
             the size that the network's folder states.
-        revision: branch, tag or commit of a Hub id.
+        revision: branch, tag or commit of a Hub id; a folder has none.
         predicts: "inverse depth" or "depth"; None tells by the network's configuration.
-        dtype: of the computation: "float32", "bf16" or "fp16" (autocast; the last layers stay in float32). None is float32 on the CPU, on
-            CUDA bf16 where the GPU has it, else fp16.
+        dtype: of the computation: "float32", without TF32, so that labels do not depend on where depth is estimated; or "bf16" or "fp16"
+            (autocast; the last layers stay in float32), which are faster on a GPU and change the labels.
         compile: whether the network goes through `torch.compile`; worth its time where most photos have the same size.
         micro_batch: images that a GPU takes at once, where their sizes allow; a photo with its mirror image is two.
 
@@ -35,7 +35,7 @@ class DepthNetwork:
     resolution: int | Literal["native"] | None = None
     revision: str | None = None
     predicts: Literal["inverse depth", "depth"] | None = None
-    dtype: str | None = None
+    dtype: str = "float32"
     compile: bool = False
     micro_batch: int = 8
 

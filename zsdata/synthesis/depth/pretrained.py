@@ -6,28 +6,34 @@ The work has two halves that may run in two places: `prepare` resizes a photo on
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from zsdata.synthesis.depth.model_folder import check_weights
 from zsdata.synthesis.depth.options import DepthNetwork
 from zsdata.synthesis.depth.preprocessing import Preprocessing, read_preprocessing
 from zsdata.synthesis.micro_batch import MicroBatch, WarmUp, measure, to_device, weight_bytes
-from zsdata.synthesis.precision import choose_dtype
+from zsdata.synthesis.precision import DTYPES, without_tf32
 
-# What a network's prediction is, by the model_type of its configuration. Depth Pro's is inverse depth: transformers inverts it afterwards.
-INVERSE_DEPTH_MODELS = ("depth_pro",)
+# What a network's prediction is, by the model_type of its configuration, which may say "metric" besides. Depth Pro's is inverse depth:
+# transformers inverts it afterwards. CHMv2's is the height of trees seen from above: what is higher is nearer, as inverse depth has it.
+INVERSE_DEPTH_MODELS = ("chmv2", "depth_anything", "depth_pro", "prompt_depth_anything")
 DEPTH_MODELS = ("glpn", "tipsv2_dpt", "zoedepth")
 METRIC_DPT_BACKBONES = ("dinov2", "dinov2_with_registers")  # DPT heads on DINOv2 predict metres (NYU, KITTI); MiDaS's predict inverse depth
 
 SMALLEST_DEPTH_M = 1e-3
+NEAREST_SHARE = 0.001  # of a photo's pixels may be nearer than the depth that is taken for its nearest point
 HUB_ID = re.compile(r"[\w.-]+(/[\w.-]+)?")
-LAST_LAYERS = ("head", "relative_head", "metric_head")  # names that transformers' depth networks give them
+# What makes depth of features, by the names that transformers' depth networks give it.
+LAST_LAYERS = ("head", "relative_head", "metric_head", "features_to_depth", "decoder.head", "bin_regressor")
 # DPT networks have these weights, published checkpoints do not, and nothing uses them: the first stage fuses nothing.
 NEVER_USED = re.compile(r"fusion_stage\.layers\.0\.residual_layer1\.")
 
@@ -36,8 +42,9 @@ class PretrainedDepth:
     """A depth-estimation network of transformers, with the pre-processing that its folder states.
 
     Photos are resized so that their short side has the network's own length (or the one asked for), keeping the aspect, to whole patches;
-    normalised; and the prediction is brought back to the photo's size. Depth is inverted. On the CPU a photo's result is the same bit for
-    bit whatever it is estimated with; on a GPU up to rounding.
+    normalised; and the prediction is brought back to the photo's size. Depth is inverted, after its nearest thousandth was set to one
+    depth: a single pixel at 0 m would leave the rest of the photo flat. On the CPU a photo's result is the same bit for bit whatever it is
+    estimated with; on a GPU up to rounding.
 
     Args:
         network: which one, and how it is run.
@@ -45,31 +52,41 @@ class PretrainedDepth:
 
     Raises:
         ImportError: transformers is not installed.
-        OSError: nothing is found under that name.
-        ValueError: weights are missing, or it is not known how photos are prepared for this kind of network or what it predicts.
+        OSError: nothing is found under that name, or a folder lacks a file.
+        ValueError: files are damaged or not those of a depth network, weights are missing, or it is not known how photos are prepared for
+            this kind of network or what it predicts.
     """
 
     def __init__(self, network: DepthNetwork, device: str | torch.device = "cpu") -> None:
-        name = network.name
         self.network, self.device = network, torch.device(device)
-        self.dtype = choose_dtype(network.dtype, self.device)
+        self.dtype = DTYPES[network.dtype]
         self.preprocessing = load_preprocessing(network)
         from transformers import AutoModelForDepthEstimation
 
-        with torch.random.fork_rng(devices=[]):  # older transformers fill the weights with random numbers first
-            loaded, report = AutoModelForDepthEstimation.from_pretrained(name, revision=network.revision, output_loading_info=True)
+        with _naming(network), torch.random.fork_rng(devices=[]):  # older transformers fill the weights with random numbers first
+            loaded, report = AutoModelForDepthEstimation.from_pretrained(
+                network.name, revision=network.revision, output_loading_info=True, ignore_mismatched_sizes=True
+            )
         missing = sorted(key for key in report["missing_keys"] if not NEVER_USED.search(key))
         if missing:
-            raise ValueError(f'depth="{name}" lacks {len(missing)} weights, "{missing[0]}" for one; download it again')
-        self._predicts_depth = (network.predicts or _predicts(name, loaded.config)) == "depth"
+            raise ValueError(f'depth="{network.name}" lacks {len(missing)} weights, "{missing[0]}" for one; download it again')
+        other = sorted(key if isinstance(key, str) else key[0] for key in report["mismatched_keys"])
+        if other:
+            raise ValueError(
+                f'depth="{network.name}" has {len(other)} weights of another shape than its config.json says, "{other[0]}" for one; '
+                "download both again"
+            )
+        self._predicts_depth = (network.predicts or _predicts(network.name, loaded.config)) == "depth"
         self._network: Any = loaded.float().eval().requires_grad_(False)  # saved in half precision or not
         cure = "lower resolution, or take a smaller network or dtype"
         to_device((self._network,), self.device, "the depth network", cure)
         if self.device.type == "cuda":
             self._network.to(memory_format=torch.channels_last)
         if self.dtype != torch.float32:
-            for layers in filter(None, (getattr(loaded, attribute, None) for attribute in LAST_LAYERS)):
-                _keep_in_float32(layers, self.device.type)
+            layers = dict(loaded.named_modules())
+            for name in LAST_LAYERS:
+                if name in layers:
+                    _keep_in_float32(layers[name], self.device.type)
         if network.compile:
             self._network.compile()
         self.micro_batch = MicroBatch("depth network", network.micro_batch, self.device, cure)
@@ -158,9 +175,19 @@ class PretrainedDepth:
 
     def _run(self, inputs: Tensor) -> Tensor:
         """uint8 [B, 3, h, w] on the device to inverse depth, float32 [B, 1, h', w']."""
-        with torch.autocast(self.device.type, self.dtype, enabled=self.dtype != torch.float32):
+        whole = self.dtype == torch.float32
+        with without_tf32(self.device) if whole else nullcontext(), torch.autocast(self.device.type, self.dtype, enabled=not whole):
             predicted = self._network(pixel_values=self.preprocessing.normalise(inputs)).predicted_depth.unsqueeze(1).float()
-        return 1 / predicted.clamp(min=SMALLEST_DEPTH_M) if self._predicts_depth else predicted
+        return _inverted(predicted) if self._predicts_depth else predicted
+
+
+def _inverted(depth: Tensor) -> Tensor:
+    """Depth [B, 1, h, w] to inverse depth; nothing is nearer than the depth that NEAREST_SHARE of its pixels, at least one, lie below."""
+    pixels = depth.flatten(1)
+    # Not by kthvalue, which torch's deterministic mode refuses on CUDA.
+    lowest = pixels.topk(1 + math.ceil(NEAREST_SHARE * pixels.shape[1]), largest=False).values
+    nearest = lowest[:, -1].clamp(min=SMALLEST_DEPTH_M)
+    return 1 / depth.maximum(nearest.view(-1, 1, 1, 1))
 
 
 def load_preprocessing(network: DepthNetwork) -> Preprocessing:
@@ -173,21 +200,50 @@ def load_preprocessing(network: DepthNetwork) -> Preprocessing:
         raise FileNotFoundError(
             f'depth="{network.name}" is neither "builtin", "stored", a folder that is there, nor a Hub id ("owner/name")'
         )
+    if os.path.isdir(network.name) and network.revision is not None:
+        raise ValueError(
+            f'depth="{network.name}" is a folder, which has no revisions; got revision={network.revision!r}. Leave revision out, or give '
+            "the Hub id"
+        )
     try:
-        from transformers import AutoConfig
+        from transformers import MODEL_FOR_DEPTH_ESTIMATION_MAPPING, AutoConfig
         from transformers.utils.hub import cached_file
     except ImportError as error:
         raise ImportError(f'depth="{network.name}" needs transformers: pip install "zsdata[depth]"') from error
-    try:
+    with _naming(network):
         config = AutoConfig.from_pretrained(network.name, revision=network.revision)
         path = cached_file(network.name, "preprocessor_config.json", revision=network.revision)
-    except OSError as error:
-        which = "" if network.revision is None else f', revision "{network.revision}",'
-        raise OSError(f'depth="{network.name}"{which} cannot be loaded: {error}') from error
-    except ValueError as error:  # no config.json, or one of a network that this transformers does not know
-        raise ValueError(f'depth="{network.name}" cannot be loaded: {error}') from error
+    built_as = getattr(config, "architectures", None) or []
+    if type(config) not in MODEL_FOR_DEPTH_ESTIMATION_MAPPING or (built_as and not any("Depth" in one for one in built_as)):
+        raise ValueError(
+            f'depth="{network.name}" is no depth network: its config.json says {" ".join([config.model_type, *built_as])}; name one that '
+            "transformers loads by AutoModelForDepthEstimation"
+        )
+    if os.path.isdir(network.name):
+        check_weights(network.name)
     with open(str(path), encoding="utf-8") as file:
-        return read_preprocessing(network.name, json.load(file), config, network.resolution)
+        try:
+            said = json.load(file)
+        except ValueError as error:
+            raise ValueError(f'depth="{network.name}": its preprocessor_config.json is no JSON ({error}); download it again') from error
+    return read_preprocessing(network.name, said, config, network.resolution)
+
+
+@contextmanager
+def _naming(network: DepthNetwork) -> Iterator[None]:
+    """Errors of transformers say which network they are about, and what can be done."""
+    which = f'depth="{network.name}"' + ("" if network.revision is None else f', revision "{network.revision}",')
+    try:
+        yield
+    except OSError as error:
+        raise OSError(f"{which} cannot be loaded: {error}") from error
+    except ImportError:  # names the package that a network needs beside transformers
+        raise
+    except Exception as error:  # what a damaged folder leads to is not foretold
+        raise ValueError(
+            f"{which} cannot be loaded: {error} Its files are damaged or of different networks: download them again; or this transformers "
+            "does not know the network: upgrade it"
+        ) from error
 
 
 def _predicts(name: str, config: Any) -> str:
@@ -197,7 +253,7 @@ def _predicts(name: str, config: Any) -> str:
     if kind == "dpt":
         backbone = getattr(getattr(config, "backbone_config", None), "model_type", None)
         return "depth" if backbone in METRIC_DPT_BACKBONES else "inverse depth"
-    if kind == "depth_anything" or kind in INVERSE_DEPTH_MODELS:
+    if kind in INVERSE_DEPTH_MODELS:
         return "inverse depth"
     raise ValueError(
         f'depth="{name}" is a {kind} network, of which it is not known whether it predicts depth or inverse depth; say so: '
@@ -209,9 +265,9 @@ def _keep_in_float32(layers: torch.nn.Module, device_type: str) -> None:
     """Lets no autocast into these layers. What they return is depth: bfloat16 would leave 256 steps of it between 1 and 2."""
     forward = layers.forward
 
-    def in_float32(*inputs: Any) -> Any:
+    def in_float32(*inputs: Any, **named: Any) -> Any:
         with torch.autocast(device_type, enabled=False):
-            return forward(*(_to_float32(value) for value in inputs))
+            return forward(*_to_float32(inputs), **{name: _to_float32(value) for name, value in named.items()})
 
     layers.forward = in_float32
 
