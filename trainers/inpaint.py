@@ -31,6 +31,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from trainers import run_folder
 from trainers.arguments import run
 from trainers.inpaint_data.layouts import LAYOUTS, StereoFolder
 from trainers.inpaint_data.sources import Examples, PhotoSource, Source, StereoSource
@@ -46,6 +47,7 @@ TARS = "tars"
 
 def main() -> None:
     arguments = _parser().parse_args()
+    run_folder.check_output(arguments.output, arguments.resume)  # before any photo is read
     names = (
         "steps",
         "batch_size",
@@ -154,7 +156,9 @@ def _parser() -> argparse.ArgumentParser:
         "--ema", type=float, metavar="DECAY", help="save and judge a moving average of the weights, such as 0.9999 (default: none)"
     )
     training.add_argument("--mixed-precision", choices=("no", "bf16", "fp16"), help="default: what `accelerate launch` was told")
-    training.add_argument("--output", type=Path, required=True, metavar="DIR", help="the run's folder: checkpoints, logs, validation.jsonl")
+    training.add_argument(
+        "--output", type=Path, required=True, metavar="DIR", help="the run's own folder: checkpoints, logs, validation.jsonl"
+    )
     training.add_argument(
         "--resume", type=Path, metavar="DIR", help="go on from the newest checkpoint of that run, or from that checkpoint"
     )

@@ -93,7 +93,7 @@ def tune(
     Args:
         pipeline: a local folder in the diffusers format.
         examples: made for `config.seed` and `config.batch_size`.
-        output: the run's folder: checkpoints, tracker logs, log.jsonl, validation.jsonl.
+        output: the run's folder: checkpoints, tracker logs, log.jsonl, validation.jsonl. Refused where it holds those of another run.
         arguments: what the run was started with, saved with its state.
         resume: a run's folder or one of its checkpoints.
         pairs: stereo pairs with dense ground truth; their holes are filled and judged before the first step and at every checkpoint.
@@ -103,6 +103,7 @@ def tune(
         ValueError, OSError: a pipeline that cannot be used, a checkpoint of other data or options, or a rank that has other data.
         RuntimeError: the loss is not finite; it names the examples.
     """
+    run_folder.check_output(output, resume)
     accelerator = Accelerator(
         cpu=not torch.accelerator.is_available(),  # without it, ranks that torchrun starts on a CPU do not find each other
         mixed_precision=config.mixed_precision,
@@ -173,7 +174,7 @@ def tune(
                     {"examples": examples.position(step).to_state(), "world_size": accelerator.num_processes, "arguments": arguments},
                 )
         accelerator.wait_for_everyone()
-        return run_folder.newest(output) / PIPELINE
+        return run_folder.folder_of(output, step) / PIPELINE
 
     def validate(folder: Path) -> None:
         if cases:

@@ -94,7 +94,8 @@ def train(
 
     Args:
         loss_function: (initial prediction, sequence of predictions, batch) -> (loss, metrics).
-        output: the run's folder: checkpoints, best, tracker logs, log.jsonl, skipped.jsonl, evaluations.jsonl, evaluation.json.
+        output: the run's folder: checkpoints, best, tracker logs, log.jsonl, skipped.jsonl, evaluations.jsonl, evaluation.json. Refused
+            where it holds the checkpoints of another run.
         model_config: {"model": name, "options": {...}}, saved with the weights.
         arguments: what the run was started with, saved with its state.
         resume: a run's folder or one of its checkpoints.
@@ -105,6 +106,7 @@ def train(
         ValueError, ImportError, OSError: options, a tracker or a checkpoint that cannot be used, or a rank that has other photos.
         TrainingDiverged: too many steps in a row had to be skipped.
     """
+    run_folder.check_output(output, resume)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "`log_with=")  # said as an error below
         accelerator = Accelerator(

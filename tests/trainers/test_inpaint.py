@@ -206,6 +206,17 @@ def test_a_resumed_run_equals_the_unbroken_one(pipeline, photos, things, tmp_pat
         assert torch.equal(found[name], weight), name
 
 
+def test_another_run_keeps_its_checkpoints_and_no_photo_is_read(pipeline, photos, tmp_path, monkeypatch):
+    saved = run(pipeline, examples_of(photos=photos), tmp_path, config())
+    before = {path.name for path in saved.parent.parent.iterdir()}
+    with pytest.raises(FileExistsError, match=r"holds the checkpoints of an earlier run, up to step 4: --resume .* another --output"):
+        run(pipeline, examples_of(photos=photos), tmp_path, config(steps=1))
+    assert {path.name for path in saved.parent.parent.iterdir()} == before
+    monkeypatch.setattr(sys, "argv", ["inpaint.py", *map(str, arguments_for(pipeline, tmp_path, "--photos", "nowhere.tar"))])
+    with pytest.raises(SystemExit, match="checkpoints of an earlier run"):
+        run_trainer(inpaint.main)
+
+
 def test_a_smaller_micro_batch_and_gradient_checkpointing_change_nothing_but_rounding(pipeline, photos, tmp_path):
     examples = examples_of(photos=photos)
     whole = weights(run(pipeline, examples, tmp_path / "whole", config(steps=2, learning_rate=1e-3)))

@@ -224,6 +224,15 @@ def test_another_number_of_steps_is_refused_on_resume(tar, tmp_path):
         run_training(tar, tmp_path / "run", config(steps=4), resume=tmp_path / "run")
 
 
+def test_another_run_keeps_its_checkpoints_and_no_photo_is_read(tar, tmp_path, monkeypatch):
+    run_training(tar, tmp_path / "run", config(steps=2))
+    with pytest.raises(FileExistsError, match=r"holds the checkpoints of an earlier run, up to step 2: --resume .* another --output"):
+        run_training(tar, tmp_path / "run", config(steps=1))
+    assert run_folder.newest(tmp_path / "run").name == "step-00000002"
+    with pytest.raises(SystemExit, match=r"^raft.py: .*checkpoints of an earlier run"):
+        run_command(monkeypatch, *arguments_for("nowhere.tar", tmp_path / "run"))
+
+
 def test_a_run_folder_holds_what_evaluation_and_resume_need(tar, tmp_path):
     matcher = run_training(tar, tmp_path / "run", config(steps=9))
     folder = run_folder.newest(tmp_path / "run")
