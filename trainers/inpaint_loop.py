@@ -22,7 +22,7 @@ from trainers.hole_scores import HoleCase, hole_cases, mean_hole_scores, score_h
 from trainers.inpaint_data.sources import ExampleBatch, Examples, requests
 from trainers.noise_prediction import NoisePrediction
 from trainers.pairs_on_disk import StereoPair
-from trainers.pipeline_folder import UNET, write_pipeline
+from trainers.pipeline_folder import UNET, frozen_digest, write_pipeline
 from trainers.weight_average import WeightAverage, weights_of
 from zsdata.faults import FailureBudget, FaultLog
 from zsdata.position import Position, require_one_place
@@ -30,6 +30,7 @@ from zsdata.progress import Progress
 from zsdata.synthesis.inpaint import load_inpainter
 from zsdata.synthesis.inpaint.diffusion_parts import CELL_PX, load_diffusion_parts
 
+MODEL = "an inpainting U-Net"
 PIPELINE = "pipeline"  # the folder in a checkpoint
 LOG_EVERY_STEPS = 10
 PREFETCHED_BATCHES = 2  # per worker
@@ -117,10 +118,13 @@ def tune(
     prediction = NoisePrediction(parts, accelerator.device, config.seed)
     cases = _validation_cases(pairs, examples, accelerator)
 
+    kept = {name: getattr(config, name) for name in ("steps", "learning_rate", "weight_decay", "ema")}
+    options = {"model": MODEL, **kept, "the pipeline's digest": frozen_digest(pipeline)}
     unet, step, training = parts.unet, 0, None
     if resume is not None:
         checkpoint = run_folder.newest(resume)
         training, state = run_folder.load(checkpoint)
+        run_folder.require_options(checkpoint, state, options, f"--pipeline {checkpoint / PIPELINE}")
         step = state["step"]
         if step >= config.steps:
             raise ValueError(f"{checkpoint} has all of the {config.steps} steps already")
@@ -144,8 +148,6 @@ def tune(
         anneal_strategy="linear",
     )
     if training is not None:
-        if training["schedule"]["total_steps"] != config.steps + 1:
-            raise ValueError(f"the run was planned for {training['schedule']['total_steps'] - 1} steps; resume it with that --steps")
         optimizer.load_state_dict(training["optimizer"])
         schedule.load_state_dict(training["schedule"])
     model, optimizer = accelerator.prepare(unet, optimizer)
@@ -171,7 +173,12 @@ def tune(
                         "schedule": schedule.state_dict(),
                         "scaler": accelerator.scaler.state_dict() if accelerator.scaler is not None else {},
                     },
-                    {"examples": examples.position(step).to_state(), "world_size": accelerator.num_processes, "arguments": arguments},
+                    {
+                        "examples": examples.position(step).to_state(),
+                        "options": options,
+                        "world_size": accelerator.num_processes,
+                        "arguments": arguments,
+                    },
                 )
         accelerator.wait_for_everyone()
         return run_folder.folder_of(output, step) / PIPELINE

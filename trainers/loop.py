@@ -38,6 +38,7 @@ RECONSTRUCT_EVERY_STEPS = 100  # how well the pairs and their labels fit togethe
 # RAFT-Stereo's schedule: a linear one-cycle that warms up for 1 % of the steps and is 100 steps longer than the training.
 WARM_UP_SHARE = 0.01
 SPARE_SCHEDULE_STEPS = 100
+SAME_NUMBERS = ("corr_implementation",)  # options of a matcher that change its memory and nothing else
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,16 +141,12 @@ def train(
         world_size=accelerator.num_processes,
     )
     output.mkdir(parents=True, exist_ok=True)
+    options = _options_of_a_run(config, model_config)
     step, training, state = 0, None, {}
     if resume is not None:
         checkpoint = run_folder.newest(resume)
         training, state = run_folder.load(checkpoint)
-        planned = training["schedule"]["total_steps"] - SPARE_SCHEDULE_STEPS
-        if planned != config.steps:
-            raise ValueError(
-                f"{checkpoint} is of a run of {planned} steps, which its learning rate follows; resume it with --steps {planned}, "
-                f"or start a new run with --initial-weights {checkpoint / WEIGHTS_FILE}"
-            )
+        run_folder.require_options(checkpoint, state, options, f"--initial-weights {checkpoint / WEIGHTS_FILE}")
         load_checkpoint(matcher, checkpoint / WEIGHTS_FILE)
     average = None if config.ema is None else WeightAverage(matcher, config.ema)
     if training is not None:
@@ -194,6 +191,7 @@ def train(
                         "stream": loader.state_dict(),
                         "validation": validation.state_dict(),
                         "guard": guard.state_dict(),
+                        "options": options,
                         "world_size": accelerator.num_processes,
                         "arguments": arguments,
                         "provenance": provenance(stream, arguments),
@@ -294,6 +292,13 @@ def train(
             save()
     accelerator.end_training()
     return results
+
+
+def _options_of_a_run(config: TrainConfig, model_config: dict[str, Any]) -> dict[str, Any]:
+    """What cannot change when a run is resumed, in plain JSON."""
+    network = {name: value for name, value in model_config.get("options", {}).items() if name not in SAME_NUMBERS}
+    kept = {name: getattr(config, name) for name in ("steps", "learning_rate", "weight_decay", "ema")}
+    return json.loads(json.dumps({"model": model_config.get("model"), **network, **kept}))
 
 
 def _reconstruction(batch: StereoBatch) -> dict[str, Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import shutil
@@ -37,6 +38,18 @@ def local_pipeline(name: str, subfolder: str = "", revision: str | None = None) 
     inner = f"{subfolder}/" if subfolder else ""
     wanted = [f"{inner}{part}/*" for part in (UNET, *FROZEN_PARTS)] + [f"{inner}{pattern}" for pattern in ABOUT]
     return Path(snapshot_download(name, revision=revision, allow_patterns=wanted, ignore_patterns=list(LEFT_OUT)), subfolder)
+
+
+def frozen_digest(folder: Path) -> str:
+    """Changes with any file of what `write_pipeline` takes over and the U-Net is tuned for; a few seconds for a large pipeline."""
+    digest = hashlib.sha256(usedforsecurity=False)
+    for path in sorted(path for part in FROZEN_PARTS for path in (folder / part).rglob("*") if path.is_file()):
+        if not any(path.match(pattern) for pattern in LEFT_OUT):
+            digest.update(f"{path.relative_to(folder).as_posix()} {path.stat().st_size}\n".encode())
+            with path.open("rb") as file:
+                while block := file.read(2**20):
+                    digest.update(block)
+    return digest.hexdigest()[:16]
 
 
 def write_pipeline(folder: Path, unet: Any, source: Path) -> None:

@@ -136,6 +136,32 @@ def load(checkpoint: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     return training, json.loads((checkpoint / "state.json").read_text())
 
 
+def require_options(checkpoint: Path, state: dict[str, Any], options: dict[str, Any], weights: str) -> None:
+    """Checks that a run is resumed with what cannot change on its way, and would be left out or mixed without a word.
+
+    Args:
+        state: of the checkpoint; has the options that its run was begun with under "options".
+        options: of this run, in plain JSON; "model" is what is trained.
+        weights: how a new run starts from this checkpoint's weights.
+
+    Raises:
+        ValueError: names the option that differs, what it was and what it is.
+    """
+    begun = state.get("options")
+    if begun is None:
+        raise ValueError(
+            f"{checkpoint} does not tell what its run was begun with: an earlier version wrote it; start a new run with {weights}"
+        )
+    if begun["model"] != options["model"]:
+        raise ValueError(f"{checkpoint} is of a run that trains {begun['model']}; this one trains {options['model']}")
+    for name in {**begun, **options}:
+        if begun.get(name) != options.get(name):
+            raise ValueError(
+                f"{checkpoint} is of a run with {name} {begun.get(name)}, this one has {options.get(name)}; resume it as it was begun, "
+                f"or start a new run with {weights}"
+            )
+
+
 def _replace(folder: Path, fill: Callable[[Path], Any]) -> Path:
     """Puts a new folder, which `fill` fills, in the place of `folder`. At any moment there is the old one, none, or the new one, whole.
 

@@ -233,12 +233,30 @@ def test_a_run_of_another_seed_data_or_length_is_not_resumed(pipeline, photos, t
         ("state's seed", examples_of(photos=photos, seed=1), config(seed=1)),
         ("state's manifest", examples_of(photos=photos, things=things), config()),
         ("state's configuration", examples_of(photos=photos, batch_size=2), config(batch_size=2, micro_batch=2)),
-        ("planned for 4 steps", examples_of(photos=photos), config(steps=6)),
-        ("has all of the 2 steps", examples_of(photos=photos), config(steps=2)),
+        ("with steps 4, this one has 6; .* --pipeline .*step-00000002/pipeline", examples_of(photos=photos), config(steps=6)),
     ]
     for message, examples, settings in cases:
         with pytest.raises(ValueError, match=message):
             run(pipeline, examples, tmp_path, settings, resume=tmp_path)
+
+
+def test_what_a_run_cannot_change_on_its_way_is_refused_on_resume(pipeline, photos, tmp_path):
+    examples = examples_of(photos=photos)
+    run(pipeline, examples, tmp_path / "run", config(steps=2, ema=0.5, save_every=1))
+    first = tmp_path / "run" / "checkpoints" / "step-00000001"
+    for change, message in {"learning_rate": 1e-3, "ema": 0.9}.items():
+        with pytest.raises(ValueError, match=rf"with {change} .*, this one has {message}"):
+            run(pipeline, examples, tmp_path / "new", config(steps=2, **({"ema": 0.5} | {change: message})), resume=first)
+    with pytest.raises(ValueError, match=r"with ema 0.5, this one has None"):
+        run(pipeline, examples, tmp_path / "new", config(steps=2), resume=first)
+    other = shutil.copytree(pipeline, tmp_path / "other")
+    weights = other / "vae" / "diffusion_pytorch_model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-1] + b"\0")
+    with pytest.raises(ValueError, match=r"with the pipeline's digest \w+, this one has \w+"):
+        run(other, examples, tmp_path / "new", config(steps=2, ema=0.5), resume=first)
+    run(first / "pipeline", examples, tmp_path / "new", config(steps=2, ema=0.5), resume=first)  # the same frozen parts
+    with pytest.raises(ValueError, match="has all of the 2 steps already"):
+        run(pipeline, examples, tmp_path / "run", config(steps=2, ema=0.5), resume=tmp_path / "run")
 
 
 def test_the_average_is_saved_and_the_training_goes_on_with_the_weights_themselves(pipeline, photos, tmp_path):

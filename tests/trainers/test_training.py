@@ -217,11 +217,30 @@ def test_the_best_of_another_folder_or_of_the_checkpoint_itself_is_restored(tar,
     assert not list((tmp_path / "elsewhere").glob(".*"))
 
 
-def test_another_number_of_steps_is_refused_on_resume(tar, tmp_path):
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (["--steps", "4"], r"with steps 2, this one has 4; .*--initial-weights .*model.safetensors"),
+        (["--learning-rate", "0.1"], "with learning_rate 0.0002, this one has 0.1"),
+        (["--ema", "0.9"], "with ema None, this one has 0.9"),
+        (["--corr-radius", "3"], "with corr_radius 4, this one has 3"),
+        (["--corr-implementation", "alt"], None),
+    ],
+)
+def test_what_a_run_cannot_change_on_its_way_is_refused_on_resume(tar, tmp_path, monkeypatch, change, message):
+    run_command(monkeypatch, *arguments_for(tar, tmp_path / "run", "--steps", 2, "--save-every", 1))
+    changed = arguments_for(tar, tmp_path / "new", "--steps", 2, *change, "--resume", tmp_path / "run" / "checkpoints" / "step-00000001")
+    if message is None:
+        run_command(monkeypatch, *changed)
+    else:
+        with pytest.raises(SystemExit, match=message):
+            run_command(monkeypatch, *changed)
+
+
+def test_a_run_of_another_matcher_is_not_resumed(tar, tmp_path, monkeypatch):
     run_training(tar, tmp_path / "run", config(steps=2))
-    AcceleratorState._reset_state(reset_partial_state=True)
-    with pytest.raises(ValueError, match=r"of a run of 2 steps.*--steps 2.*--initial-weights"):
-        run_training(tar, tmp_path / "run", config(steps=4), resume=tmp_path / "run")
+    with pytest.raises(SystemExit, match="is of a run that trains raft_stereo; this one trains igev_stereo"):
+        run_command(monkeypatch, *arguments_for(tar, tmp_path / "new", "--resume", tmp_path / "run", small=[]), trainer=igev)
 
 
 def test_another_run_keeps_its_checkpoints_and_no_photo_is_read(tar, tmp_path, monkeypatch):
