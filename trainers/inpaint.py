@@ -67,6 +67,7 @@ def main() -> None:
         local_pipeline(arguments.pipeline, arguments.subfolder, arguments.revision),
         examples,
         config,
+        subfolder=arguments.subfolder,
         output=arguments.output,
         arguments={argument: str(value) for argument, value in vars(arguments).items()},
         resume=arguments.resume,

@@ -82,6 +82,7 @@ def tune(
     *,
     output: Path,
     arguments: dict[str, Any],
+    subfolder: str = "",
     resume: Path | None = None,
     pairs: list[StereoPair] | None = None,
     tracker: str | None = "tensorboard",
@@ -92,10 +93,11 @@ def tune(
     stopped, and other numbers of ranks or another micro_batch change it only by rounding.
 
     Args:
-        pipeline: a local folder in the diffusers format.
+        pipeline: a local folder in the diffusers format, or one that holds it, with the card and the licence.
         examples: made for `config.seed` and `config.batch_size`.
         output: the run's folder: checkpoints, tracker logs, log.jsonl, validation.jsonl. Refused where it holds those of another run.
         arguments: what the run was started with, saved with its state.
+        subfolder: where in `pipeline` it lies.
         resume: a run's folder or one of its checkpoints.
         pairs: stereo pairs with dense ground truth; their holes are filled and judged before the first step and at every checkpoint.
         tracker: any of Accelerate's, or None.
@@ -114,12 +116,12 @@ def tune(
     accumulate = accelerator.gradient_accumulation_steps = config.accumulate(accelerator.num_processes)
     if any(side % CELL_PX for side in examples.size):
         raise ValueError(f"crops are multiples of {CELL_PX} px high and wide; got {examples.size}")
-    parts = load_diffusion_parts(str(pipeline))
+    parts = load_diffusion_parts(str(pipeline), subfolder)
     prediction = NoisePrediction(parts, accelerator.device, config.seed)
     cases = _validation_cases(pairs, examples, accelerator)
 
     kept = {name: getattr(config, name) for name in ("steps", "learning_rate", "weight_decay", "ema")}
-    options = {"model": MODEL, **kept, "the pipeline's digest": frozen_digest(pipeline)}
+    options = {"model": MODEL, **kept, "the pipeline's digest": frozen_digest(pipeline / subfolder)}
     unet, step, training = parts.unet, 0, None
     if resume is not None:
         checkpoint = run_folder.newest(resume)
@@ -166,7 +168,7 @@ def tune(
                 run_folder.write(
                     output,
                     step,
-                    lambda folder: write_pipeline(folder / PIPELINE, unet, pipeline),
+                    lambda folder: write_pipeline(folder / PIPELINE, unet, pipeline, subfolder),
                     {
                         "weights": raw,
                         "optimizer": optimizer.state_dict(),
@@ -194,7 +196,7 @@ def tune(
 
     saved = output
     if training is None:
-        validate(pipeline)
+        validate(pipeline / subfolder)
     faults = FaultLog(FailureBudget())
     batches = iter(_loader(examples, config, step, accelerator))
     progress = Progress(total=config.steps, initial=step, unit="step", disable=not accelerator.is_main_process, dynamic_ncols=True)

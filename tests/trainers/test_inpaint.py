@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from accelerate.state import AcceleratorState
+from huggingface_hub.utils import filter_repo_objects
 from safetensors.torch import load_file
 from skimage.metrics import structural_similarity
 
@@ -31,8 +32,8 @@ from zsdata import AdaptiveDisparity, ZeroStereoStream, load_inpainter
 from zsdata.source.manifest import build_manifest
 from zsdata.synthesis.inpaint.diffusion_parts import load_diffusion_parts
 
-pytest.importorskip("diffusers")
-pytest.importorskip("transformers")
+diffusers = pytest.importorskip("diffusers")
+transformers = pytest.importorskip("transformers")
 
 ROOT = Path(__file__).resolve().parents[2]
 PUBLISHED = SHARED / "published" / "tiny_inpainting"
@@ -390,13 +391,80 @@ def test_a_pipeline_is_found_in_the_hubs_cache_without_network(pipeline, tmp_pat
     program = (
         "from trainers.pipeline_folder import local_pipeline\n"
         'folder = local_pipeline("somebody/pipelines", "StereoGen")\n'
-        'assert (folder / "unet" / "config.json").is_file(), folder\n'
+        'assert (folder / "StereoGen" / "unet" / "config.json").is_file(), folder\n'
     )
     offline = {**os.environ, "HF_HOME": str(tmp_path), "HF_HUB_CACHE": str(tmp_path / "hub"), "HF_HUB_OFFLINE": "1"}
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, env=offline, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     with pytest.raises(FileNotFoundError, match="neither a folder nor a Hub id"):
         local_pipeline("no/such/folder")
+    with pytest.raises(FileNotFoundError, match=r'no folder "StereoJen" in'):
+        local_pipeline(str(repository), "StereoJen")
+
+
+def test_what_is_downloaded_is_what_is_needed(monkeypatch, tmp_path):
+    """The card and the licence of the repository's root too, but no safety checker of a gigabyte, nor a piece of it."""
+    files = ["README.md", "LICENSE.txt", "model_index.json", "unet/config.json", "img/teaser.json"]
+    inner = ["README.md", "model_index.json", "feature_extractor/preprocessor_config.json", "safety_checker/config.json"]
+    inner += ["safety_checker/model.safetensors", "image_encoder/config.json"]
+    for part in ("unet", "vae", "text_encoder"):
+        inner += [f"{part}/config.json", f"{part}/model.safetensors", f"{part}/model.fp16.safetensors", f"{part}/model.bin"]
+    asked = {}
+
+    def snapshot_download(name, revision, allow_patterns, ignore_patterns):
+        every = [*files, *(f"StereoGen/{file}" for file in inner)]
+        asked["files"] = list(filter_repo_objects(every, allow_patterns=allow_patterns, ignore_patterns=ignore_patterns))
+        return tmp_path
+
+    monkeypatch.setattr("huggingface_hub.snapshot_download", snapshot_download)
+    local_pipeline("somebody/pipelines", "StereoGen")
+    weighted = [f"StereoGen/{part}/{file}" for part in ("unet", "vae", "text_encoder") for file in ("config.json", "model.safetensors")]
+    about = ["StereoGen/README.md", "StereoGen/model_index.json", "StereoGen/feature_extractor/preprocessor_config.json"]
+    assert sorted(asked["files"]) == sorted(["README.md", "LICENSE.txt", *about, *weighted])
+
+
+@pytest.mark.parametrize("safety_checker", ["whole", "without weights"])
+def test_diffusers_itself_loads_what_is_written(pipeline, photos, tmp_path, safety_checker):
+    """Whatever parts the index names: those that are there come along, the others are given up."""
+    from diffusers.pipelines.stable_diffusion.safety_checker import StableDiffusionSafetyChecker
+
+    source = shutil.copytree(pipeline, tmp_path / "source")
+    unet = source / "unet" / "config.json"
+    unet.write_text(json.dumps(json.loads(unet.read_text()) | {"sample_size": 64}))
+    extractor, checker = source / "feature_extractor", source / "safety_checker"
+    transformers.CLIPImageProcessor().save_pretrained(extractor)
+    vision = {"hidden_size": 8, "intermediate_size": 8, "num_hidden_layers": 1, "num_attention_heads": 1}
+    settings = transformers.CLIPConfig(projection_dim=8, vision_config=vision, text_config=vision | {"vocab_size": 4})
+    StableDiffusionSafetyChecker(settings).save_pretrained(checker)
+    if safety_checker == "without weights":
+        (checker / "model.safetensors").rename(checker / "pytorch_model.bin")
+    parts = {
+        "feature_extractor": ["transformers", "CLIPImageProcessor"],
+        "safety_checker": ["stable_diffusion", "StableDiffusionSafetyChecker"],
+        "image_encoder": [None, None],
+        "scheduler": ["diffusers", "PNDMScheduler"],
+        "text_encoder": ["transformers", "CLIPTextModel"],
+        "tokenizer": ["transformers", "CLIPTokenizer"],
+        "unet": ["diffusers", "UNet2DConditionModel"],
+        "vae": ["diffusers", "AutoencoderKL"],
+    }
+    index = {"_class_name": "StableDiffusionInpaintPipeline", "_diffusers_version": "0.8.0", "requires_safety_checker": False, **parts}
+    (source / "model_index.json").write_text(json.dumps(index))
+    saved = run(source, examples_of(photos=photos), tmp_path / "run", config(steps=1))
+    loaded = diffusers.DiffusionPipeline.from_pretrained(saved)
+    assert loaded.feature_extractor is not None and (loaded.safety_checker is not None) == (safety_checker == "whole")
+    assert json.loads((saved / "model_index.json").read_text())["image_encoder"] == [None, None]
+
+
+def test_the_licence_of_a_repository_goes_with_what_was_tuned_from_a_part_of_it(pipeline, photos, tmp_path):
+    shutil.copytree(pipeline, tmp_path / "source" / "StereoGen")
+    (tmp_path / "source" / "README.md").write_text("---\nlicense: mit\n---\n")
+    (tmp_path / "source" / "LICENSE").write_text("MIT")
+    saved = run(tmp_path / "source", examples_of(photos=photos), tmp_path / "own", config(steps=1), subfolder="StereoGen")
+    assert "openrail" in (saved / "README.md").read_text() and (saved / "LICENSE").read_text() == "MIT"
+    (tmp_path / "source" / "StereoGen" / "README.md").unlink()
+    saved = run(tmp_path / "source", examples_of(photos=photos), tmp_path / "roots", config(steps=1), subfolder="StereoGen")
+    assert "license: mit" in (saved / "README.md").read_text()
 
 
 def arguments_for(pipeline, output, *more):
