@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -122,12 +123,12 @@ def tune(
 
     kept = {name: getattr(config, name) for name in ("steps", "learning_rate", "weight_decay", "ema")}
     options = {"model": MODEL, **kept, "the pipeline's digest": frozen_digest(pipeline / subfolder)}
-    unet, step, training = parts.unet, 0, None
+    unet, step, training, refused_before = parts.unet, 0, None, Counter[str]()
     if resume is not None:
         checkpoint = run_folder.newest(resume)
         training, state = run_folder.load(checkpoint)
         run_folder.require_options(checkpoint, state, options, f"--pipeline {checkpoint / PIPELINE}")
-        step = state["step"]
+        step, refused_before = state["step"], Counter(state["refused"])
         if step >= config.steps:
             raise ValueError(f"{checkpoint} has all of the {config.steps} steps already")
         Position.from_state(state["examples"], examples.position(step))
@@ -162,7 +163,14 @@ def tune(
     if tracker is not None:
         accelerator.init_trackers(output.name or "run", {name: value for name, value in asdict(config).items() if value is not None})
 
+    faults = FaultLog(FailureBudget(), ranks=accelerator.num_processes)
+
+    def refused() -> dict[str, int]:
+        """Pairs and photos that could not be used, by reason, of all ranks and since the run began."""
+        return dict(sum(gather_object([faults.by_reason]), start=refused_before))
+
     def save() -> Path:
+        refused_so_far = refused()
         if accelerator.is_main_process:
             with weights_of(average, unet) as raw:
                 run_folder.write(
@@ -178,6 +186,7 @@ def tune(
                     {
                         "examples": examples.position(step).to_state(),
                         "options": options,
+                        "refused": refused_so_far,
                         "world_size": accelerator.num_processes,
                         "arguments": arguments,
                     },
@@ -197,7 +206,6 @@ def tune(
     saved = output
     if training is None:
         validate(pipeline / subfolder)
-    faults = FaultLog(FailureBudget())
     batches = iter(_loader(examples, config, step, accelerator))
     progress = Progress(total=config.steps, initial=step, unit="step", disable=not accelerator.is_main_process, dynamic_ncols=True)
     mark, waited = (step, time.perf_counter()), 0.0
@@ -231,16 +239,18 @@ def tune(
                 "wait_share": waited / elapsed,
             }
             mark, waited = (step, time.perf_counter()), 0.0
+            reasons = refused()
             progress.set_postfix_str(
                 f"loss {values['loss']:.4f}, {values['examples_per_second']:.1f} examples/s, waiting {values['wait_share']:.0%}"
             )
             if accelerator.is_main_process:
-                _append(output / "log.jsonl", {"step": step, **values})
-            accelerator.log(values, step=step)
+                _append(output / "log.jsonl", {"step": step, **values, "refused": reasons})
+            accelerator.log({**values, "refused": sum(reasons.values())}, step=step)
         if step % config.save_every == 0 or step == config.steps:
             saved = save()
             validate(saved)
     progress.close()
+    accelerator.print(_summary(refused()))
     accelerator.end_training()
     return saved
 
@@ -274,6 +284,11 @@ def _validate(folder: Path, cases: list[HoleCase], config: TuneConfig, accelerat
         inpaint = load_inpainter(folder, accelerator.device, steps=config.validation_steps)
         scores = [(number, score_holes(inpaint, case, number, config.seed)) for number, case in mine]
     return [score for _, score in sorted(gather_object(scores), key=lambda entry: entry[0])]
+
+
+def _summary(refused: dict[str, int]) -> str:
+    reasons = ", ".join(f"{reason}: {count}" for reason, count in refused.items())
+    return f"refused, and replaced by others: {reasons}" if refused else "no pair and no photo was refused"
 
 
 def _append(path: Path, values: dict[str, Any]) -> None:

@@ -29,6 +29,7 @@ from trainers.pairs_on_disk import StereoPair
 from trainers.pipeline_folder import local_pipeline
 from trainers.weight_average import WeightAverage
 from zsdata import AdaptiveDisparity, ZeroStereoStream, load_inpainter
+from zsdata.faults import FaultLog
 from zsdata.source.manifest import build_manifest
 from zsdata.synthesis.inpaint.diffusion_parts import load_diffusion_parts
 
@@ -216,6 +217,28 @@ def test_another_run_keeps_its_checkpoints_and_no_photo_is_read(pipeline, photos
     monkeypatch.setattr(sys, "argv", ["inpaint.py", *map(str, arguments_for(pipeline, tmp_path, "--photos", "nowhere.tar"))])
     with pytest.raises(SystemExit, match="checkpoints of an earlier run"):
         run_trainer(inpaint.main)
+
+
+def test_what_is_refused_is_counted_by_reason_over_ranks_and_resumes(pipeline, things, tmp_path, capsys, monkeypatch):
+    broken = shutil.copytree(things, tmp_path / "things")
+    (broken / "frames_cleanpass" / "TRAIN" / "A" / "0000" / "right" / "0002.png").unlink()
+    run(pipeline, examples_of(things=broken), tmp_path / "run", config(steps=4, save_every=2, workers=1))  # each pair comes once in a step
+    assert "refused, and replaced by others: no file: 4" in capsys.readouterr().out
+    (line,) = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert line["step"] == 4 and line["refused"] == {"no file": 4}
+    half = tmp_path / "run" / "checkpoints" / "step-00000002"
+    assert json.loads((half / "state.json").read_text())["refused"] == {"no file": 2}
+    logs = []
+    monkeypatch.setattr(inpaint_loop, "FaultLog", lambda budget, ranks: logs.append(ranks) or FaultLog(budget, ranks))
+    saved = run(pipeline, examples_of(things=broken), tmp_path / "resumed", config(steps=4), resume=half)
+    assert json.loads((saved.parent / "state.json").read_text())["refused"] == {"no file": 4} and logs == [1]
+
+
+def test_faults_in_the_tars_of_photos_are_told(photos, tmp_path, caplog):
+    cut = tmp_path / "cut.tar"
+    cut.write_bytes(Path(photos).read_bytes()[:-20_000])
+    examples_of(photos=cut)
+    assert "1 faults in the tars of photos, the first:" in caplog.text
 
 
 def test_a_smaller_micro_batch_and_gradient_checkpointing_change_nothing_but_rounding(pipeline, photos, tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -31,6 +32,8 @@ from zsdata.synthesis.depth.options import STORED
 from zsdata.synthesis.depth.pretrained import load_preprocessing
 from zsdata.synthesis.disparity import AdaptiveDisparity
 from zsdata.worker import MOST_SPARES, SHORTEST_SIDE_PX, single_thread
+
+logger = logging.getLogger("zsdata")
 
 
 class Source(Protocol):
@@ -86,6 +89,11 @@ class PhotoSource:
     def __init__(self, manifest: Manifest, depth: str | DepthEstimator, scale: AdaptiveDisparity) -> None:
         self._manifest, self._name, self._scale = manifest, depth, scale
         self._depth: DepthEstimator | None = None
+        if manifest.problems:
+            first = manifest.problems[0]
+            logger.warning(
+                "%d faults in the tars of photos, the first: %s: %s", len(manifest.problems), first.key or first.shard, first.reason
+            )
         network = as_network(depth)
         if network is not None:
             load_preprocessing(network)  # what cannot be loaded fails here, and not in a worker
