@@ -1,7 +1,7 @@
 """Fine-tunes a diffusion inpainting model on the holes that stereo leaves: what a right camera sees and the left one does not.
 
 accelerate launch trainers/inpaint.py --pipeline sd2-community/stable-diffusion-2-inpainting --photos "shards/*.tar" \\
-    --depth depth-anything/Depth-Anything-V2-Small-hf --mixed-precision bf16 --output runs/inpaint
+    --depth depth-anything/Depth-Anything-V2-Small-hf --depth-cache depth --mixed-precision bf16 --output runs/inpaint
 accelerate launch trainers/inpaint.py --pipeline sd2-community/stable-diffusion-2-inpainting \\
     --datasets sceneflow-final=data/sceneflow tartanair=data/tartanair crestereo=data/crestereo vkitti2=data/vkitti2 --output runs/inpaint
 
@@ -92,7 +92,9 @@ def open_sources(arguments: argparse.Namespace) -> dict[str, Source]:
             raise ValueError(f"{kind} is named twice; put both below one folder, or give a pattern of tars")
         sources[kind] = StereoSource(StereoTars(where) if kind == TARS else StereoFolder(kind, where))
     if arguments.photos:
-        sources["photos"] = PhotoSource(build_manifest(arguments.photos), arguments.depth, AdaptiveDisparity())
+        sources["photos"] = PhotoSource(build_manifest(arguments.photos), arguments.depth, AdaptiveDisparity(), arguments.depth_cache)
+    elif arguments.depth_cache is not None:
+        raise ValueError("--depth-cache keeps the depth of photos; name --photos, or leave it out")
     if not sources:
         raise ValueError("nothing to learn from: name --photos or --datasets (or both)")
     return sources
@@ -124,7 +126,14 @@ def _parser() -> argparse.ArgumentParser:
     data.add_argument(
         "--depth",
         default="builtin",
-        help='for photos: "builtin", a Hub id or folder in the transformers format, or "stored", the maps beside them (default: builtin)',
+        help='for photos: "builtin", a Hub id or folder in the transformers format, or "stored", the maps beside them in the tars, where '
+        "`zsdata pack` puts NAME.depth.npy or NAME.depth.png with NAME.jpg (default: builtin)",
+    )
+    data.add_argument(
+        "--depth-cache",
+        metavar="DIR",
+        help="keep each photo's depth there: it is estimated once, not once per epoch on one CPU thread; a matcher's trainer that was "
+        "given this folder and --depth has filled it already",
     )
     data.add_argument("--datasets", nargs="+", default=[], metavar="KIND=FOLDER", help="synthetic stereo, see above")
     data.add_argument(

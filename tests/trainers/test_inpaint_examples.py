@@ -9,6 +9,7 @@ from tests.scenes import jpeg, layered_depth, photo, photo_tar, write_tar
 from trainers.inpaint_data.examples import SYMMETRIC_COLOUR, from_photo, from_stereo, hidden_from_left
 from trainers.inpaint_data.sources import ExampleBatch, Examples, PhotoSource, StereoSource, requests
 from trainers.inpaint_data.stored_maps import StereoFrame
+from zsdata import ZeroStereoStream
 from zsdata.augment import AugmentConfig
 from zsdata.faults import BadPhoto, NoUsablePhoto
 from zsdata.seeding import rng
@@ -276,6 +277,33 @@ def test_depth_stored_beside_the_photos_gives_the_examples_of_the_estimator_that
     }
     with pytest.raises(ValueError, match="not one of the 3 photos"):
         made("stored", photos)
+
+
+def test_depth_is_estimated_once_and_a_stream_may_have_done_it(tmp_path):
+    tar, calls = photo_tar(tmp_path / "photos.tar", 3, height=64, width=96), []
+
+    def estimator(images):
+        calls.append(len(images))
+        return layered_depth(images)
+
+    estimator.cache_name = "layered"
+
+    def made(cache=None, depth=estimator):
+        examples = Examples({"photos": PhotoSource(build_manifest(tar), depth, AdaptiveDisparity(), cache)}, (32, 48), 0, 3)
+        return [examples[step, number] for step in range(2) for number in range(3)]
+
+    without, first, estimated = made(), made(tmp_path / "cache"), len(calls)
+    again = made(tmp_path / "cache")
+    assert estimated == 6 + 2 * 3 and len(calls) == estimated  # once per epoch without; once with, and mirrored
+    for one, other, third in zip(without, first, again, strict=True):
+        assert torch.equal(one.inpaint_mask, other.inpaint_mask) and torch.equal(other.right, third.right)
+    for pair in ZeroStereoStream(tar, size=(32, 48), depth=estimator, depth_cache=tmp_path / "of a stream"):
+        assert pair is not None
+    estimated = len(calls)
+    made(tmp_path / "of a stream")
+    assert len(calls) == estimated
+    with pytest.raises(ValueError, match="a depth cache would keep it a second time"):
+        made(tmp_path / "cache", "stored")
 
 
 def test_a_depth_network_that_is_nowhere_is_named_at_once(tmp_path):

@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset
@@ -25,13 +27,16 @@ from zsdata.source.depth_map import decode_depth
 from zsdata.source.manifest import Manifest
 from zsdata.source.photo import PhotoFile
 from zsdata.sources import check_depth_maps
-from zsdata.synthesis.confidence import normalize_inverse_depth
+from zsdata.stream import DEPTH_CACHE_BYTES
 from zsdata.synthesis.depth import DepthEstimator, as_network, load_depth
 from zsdata.synthesis.depth.builtin import warn_once
+from zsdata.synthesis.depth.cache import DepthCache, photo_digest
+from zsdata.synthesis.depth.identity import depth_identity
 from zsdata.synthesis.depth.options import STORED
 from zsdata.synthesis.depth.pretrained import load_preprocessing
 from zsdata.synthesis.disparity import AdaptiveDisparity
-from zsdata.worker import MOST_SPARES, SHORTEST_SIDE_PX, single_thread
+from zsdata.synthesis.synthesizer import NEAREST, SynthesisConfig, estimate_depth, given_depth
+from zsdata.worker import MOST_SPARES, SHORTEST_SIDE_PX, single_thread, store_depth
 
 logger = logging.getLogger("zsdata")
 
@@ -80,13 +85,23 @@ class PhotoSource:
         manifest: of the tars that hold the photos.
         depth: as `load_depth` takes it; or "stored", the maps beside the photos.
         scale: draws how far apart the cameras stand.
+        depth_cache: a folder that keeps the depth of every photo, so that it is estimated once and not in every epoch. Shared with streams
+            that weigh their labels by confidence, so depth of the mirrored photo is estimated and kept with it.
 
     Raises:
-        ValueError: "stored", and no photo has a map.
+        ValueError: "stored", and no photo has a map, or a cache is asked to keep the maps a second time.
         ImportError, OSError, ValueError: a network that cannot be loaded.
     """
 
-    def __init__(self, manifest: Manifest, depth: str | DepthEstimator, scale: AdaptiveDisparity) -> None:
+    def __init__(
+        self,
+        manifest: Manifest,
+        depth: str | DepthEstimator,
+        scale: AdaptiveDisparity,
+        depth_cache: str | os.PathLike[str] | None = None,
+    ) -> None:
+        if depth == STORED and depth_cache is not None:
+            raise ValueError(f'depth "{STORED}" is read from the tars, and a depth cache would keep it a second time; leave the cache out')
         self._manifest, self._name, self._scale = manifest, depth, scale
         self._depth: DepthEstimator | None = None
         if manifest.problems:
@@ -101,6 +116,9 @@ class PhotoSource:
             check_depth_maps("photos", manifest)
         elif depth == "builtin":
             warn_once()  # here, and not in every worker
+        self._cache: DepthCache | None = None
+        if depth_cache is not None:
+            self._cache = DepthCache(depth_cache, DEPTH_CACHE_BYTES, f"{depth_identity(depth)}, flip confidence")  # as a stream calls it
 
     @property
     def digest(self) -> str:
@@ -115,20 +133,34 @@ class PhotoSource:
         return member.shard_url, member.key
 
     def make(self, index: int, size: tuple[int, int], draw: Draw) -> Example:
-        file = PhotoFile(self._manifest.read(index))
+        data = self._manifest.read(index)
+        file = PhotoFile(data)
         width, height, _ = file.header
         if min(height, width) < SHORTEST_SIDE_PX:
             raise BadPhoto(f"too small: a side shorter than {SHORTEST_SIDE_PX} px: {width}x{height}")
         photo = file.decode()
         if self._name == STORED:
-            depth = torch.from_numpy(decode_depth(self._manifest.read_depth(index), file.header))[None, None]
+            depth = given_depth(torch.from_numpy(decode_depth(self._manifest.read_depth(index), file.header))[None, None]).inverse_depth
         else:
-            if self._depth is None:
-                self._depth = load_depth(self._name)
-            image = torch.from_numpy(photo).permute(2, 0, 1)[None].to(torch.float32, memory_format=torch.contiguous_format)
-            with torch.inference_mode():
-                depth = self._depth(image)
-        return from_photo(photo, normalize_inverse_depth(depth), self._scale, size, draw)
+            depth = self._estimated(photo, data)
+        return from_photo(photo, depth.float() / NEAREST, self._scale, size, draw)
+
+    def _estimated(self, photo: np.ndarray, data: bytes) -> Tensor:
+        """Inverse depth as whole numbers, which come out of the cache as they went in."""
+        cache, digest = self._cache, ""
+        if cache is not None:
+            digest = photo_digest(data)
+            cached = cache.load(digest)
+            if cached is not None and cached.size == photo.shape[:2]:
+                return torch.from_numpy(cached.inverse_depth)[None, None]
+        if self._depth is None:
+            self._depth = load_depth(self._name)
+        image = torch.from_numpy(photo).permute(2, 0, 1)[None].to(torch.float32, memory_format=torch.contiguous_format)
+        with torch.inference_mode():
+            depth = estimate_depth(self._depth, image, SynthesisConfig(flip_confidence=cache is not None))
+        if cache is not None:
+            store_depth(cache, digest, depth)
+        return depth.inverse_depth
 
 
 @dataclass(frozen=True)
