@@ -155,6 +155,14 @@ def test_all_of_scene_flow_is_found_from_one_folder_also_as_webp_and_through_lin
     assert all(np.abs(pairs.read(i).left.astype(int) - LEFT).max() <= 1 for i in range(3))
 
 
+def test_links_that_go_round_or_lead_to_one_folder_count_each_pair_once(tmp_path):
+    root = write(tmp_path / "all", PUBLISHED["sceneflow-clean"][0])
+    for name, target in {"again": "FlyingThings3D", "current": ".", "latest": ".", "FlyingThings3D/up": ".."}.items():
+        os.symlink(target, root / name)  # "again" comes before the folder itself
+    pairs = StereoFolder("sceneflow-clean", root)
+    assert [pairs.place(i)[1] for i in range(len(pairs))] == ["FlyingThings3D/frames_cleanpass/TRAIN/A/0000/left/0006.png"]
+
+
 @pytest.mark.skipif(not THINGS.is_dir(), reason="the real pair is not here")
 def test_the_real_flyingthings3d_pair_reprojects(tmp_path):
     where = {"left.png": "frames_cleanpass/{}/left/0006.png", "right.png": "frames_cleanpass/{}/right/0006.png"}

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import re
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -177,11 +178,20 @@ class StereoFolder:
 
 
 def _files_below(root: Path) -> list[str]:
-    """Paths relative to `root`; links to folders are followed, as data sets are often linked together."""
-    found = []
-    for folder, _, names in os.walk(root, followlinks=True):
-        inner = Path(folder).relative_to(root).as_posix()
-        found += names if inner == "." else [f"{inner}/{name}" for name in names]
+    """Paths relative to `root`. Links to folders are followed, as data sets are often linked together; but no folder is visited twice, and
+    one that has a place of its own counts there."""
+    found, visited, starts = list[str](), set[tuple[int, int]](), deque([root])
+    while starts:
+        for folder, below, names in os.walk(starts.popleft()):  # follows no link itself
+            known = os.stat(folder)
+            if (known.st_dev, known.st_ino) in visited:
+                below.clear()
+                continue
+            visited.add((known.st_dev, known.st_ino))
+            inner = Path(folder).relative_to(root)
+            found += [(inner / name).as_posix() for name in names]
+            below.sort()
+            starts += [path for path in (Path(folder, name) for name in below) if path.is_symlink()]
     return found
 
 
