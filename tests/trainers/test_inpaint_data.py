@@ -138,6 +138,20 @@ def test_a_pair_is_read_as_it_is_published(tmp_path, kind):
     assert pairs.place(0) == (str(tmp_path), next(iter(files)))
 
 
+@pytest.mark.parametrize("root", ["", "vkitti_2.0.3_rgb"])
+def test_virtual_kitti_is_read_as_its_tars_unpack_too(tmp_path, root):
+    files, disparity = PUBLISHED["vkitti2"]
+    files = files | {"Scene01/15-deg-left/frames/depth/Camera_1/depth_00000.png": png(DEPTH_CM)}
+    write(tmp_path, {f"vkitti_2.0.3_{'depth' if '/depth/' in name else 'rgb'}/{name}": data for name, data in files.items()})
+    pairs = StereoFolder("vkitti2", tmp_path / root)
+    frame = pairs.read(0)
+    assert len(pairs) == 1 and frame.right_disparity is not None
+    assert np.allclose(frame.disparity, disparity, rtol=1e-6)
+    (tmp_path / "vkitti_2.0.3_depth" / "Scene01/15-deg-left/frames/depth/Camera_0/depth_00000.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"no file .*vkitti_2.0.3_depth/Scene01.*depth_00000.png, which belongs to .*rgb_00000.jpg"):
+        StereoFolder("vkitti2", tmp_path / root)
+
+
 def test_disparity_of_the_right_view_is_positive_too(tmp_path):
     frame = StereoFolder("sceneflow-clean", write(tmp_path, PUBLISHED["sceneflow-clean"][0])).read(0)
     assert frame.right_disparity is not None and np.allclose(frame.right_disparity, RIGHT_DISPARITY, rtol=1e-6)
