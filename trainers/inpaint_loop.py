@@ -21,6 +21,7 @@ from torch.utils.data import DataLoader
 from trainers import run_folder
 from trainers.hole_scores import HoleCase, hole_cases, mean_hole_scores, score_holes
 from trainers.inpaint_data.sources import ExampleBatch, Examples, requests
+from trainers.memory import out_of_memory_is_cured_by
 from trainers.noise_prediction import NoisePrediction
 from trainers.pairs_on_disk import StereoPair
 from trainers.pipeline_folder import UNET, frozen_digest, write_pipeline
@@ -76,6 +77,7 @@ class TuneConfig:
         return self.batch_size // at_once
 
 
+@out_of_memory_is_cured_by("lower --micro-batch, add --gradient-checkpointing or --mixed-precision bf16, or lower --size")
 def tune(
     pipeline: Path,
     examples: Examples,
@@ -106,6 +108,7 @@ def tune(
     Raises:
         ValueError, OSError: a pipeline that cannot be used, a checkpoint of other data or options, or a rank that has other data.
         RuntimeError: the loss is not finite; it names the examples.
+        MemoryError: the device's memory is too small; says what to lower.
     """
     run_folder.check_output(output, resume)
     accelerator = Accelerator(

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from trainers import run_folder
 from trainers.evaluate import mean_scores, table
+from trainers.memory import out_of_memory_is_cured_by
 from trainers.models import Matcher, load_checkpoint
 from trainers.models.checkpoint import WEIGHTS_FILE
 from trainers.provenance import provenance
@@ -75,6 +76,9 @@ class TrainConfig:
             raise ValueError(f"ema is a decay in (0, 1), such as 0.999; got {self.ema}")
 
 
+@out_of_memory_is_cured_by(
+    "lower --batch-size (and raise --accumulate by as much), add --mixed-precision bf16, or lower --size or --iterations"
+)
 def train(
     matcher: Matcher,
     loss_function: LossFunction,
@@ -105,6 +109,7 @@ def train(
         tracker: any of Accelerate's by name, one of your own, or None.
     Raises:
         ValueError, ImportError, OSError: options, a tracker or a checkpoint that cannot be used, or a rank that has other photos.
+        MemoryError: the device's memory is too small; says what to lower.
         TrainingDiverged: too many steps in a row had to be skipped.
     """
     run_folder.check_output(output, resume)

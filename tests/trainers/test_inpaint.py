@@ -384,6 +384,20 @@ def test_a_loss_that_is_not_finite_names_the_examples(pipeline, photos, tmp_path
         run(pipeline, examples_of(photos=photos), tmp_path, config())
 
 
+@pytest.mark.filterwarnings("ignore:The built-in depth")
+def test_a_device_that_is_too_small_is_one_line_that_says_what_to_lower(pipeline, photos, tmp_path, monkeypatch):
+    def full(self, model, batch):
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.\nmore lines")
+
+    monkeypatch.setattr(NoisePrediction, "loss", full)
+    data = ["--photos", photos, "--depth", "builtin", "--tracker", "none"]
+    monkeypatch.setattr(sys, "argv", ["inpaint.py", *map(str, arguments_for(pipeline, tmp_path / "run", *data))])
+    with pytest.raises(
+        SystemExit, match=r"^inpaint.py: .* lower --micro-batch, add --gradient-checkpointing .*--size\. CUDA out of .* GiB\.$"
+    ):
+        run_trainer(inpaint.main)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -304,6 +304,14 @@ def test_too_many_skipped_steps_in_a_row_are_an_error_and_the_run_can_be_resumed
     assert all(torch.isfinite(weight).all() for weight in matcher.state_dict().values())
 
 
+def test_a_device_that_is_too_small_is_an_error_that_says_what_to_lower(tar, tmp_path):
+    def full(initial, sequence, batch):
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+
+    with pytest.raises(MemoryError, match=r"lower --batch-size .* CUDA out of memory"):
+        run_training(tar, tmp_path / "run", config(steps=1), loss=full)
+
+
 def test_mixed_precision_trains_and_judges_as_evaluate_does(tar, tmp_path, pairs_folder):
     sets = [EvaluationSet.parse(str(pairs_folder))]
     settings = config(steps=2, mixed_precision="bf16", channels_last=True, evaluation_iterations=3)
