@@ -16,11 +16,11 @@ from typing import Any
 import torch
 from accelerate import Accelerator
 from accelerate.utils import gather_object
-from torch.utils.data import DataLoader
 
 from trainers import run_folder
 from trainers.hole_scores import HoleCase, hole_cases, mean_hole_scores, score_holes
-from trainers.inpaint_data.sources import ExampleBatch, Examples, requests
+from trainers.inpaint_data.batches import making, requests
+from trainers.inpaint_data.sources import ExampleBatch, Examples
 from trainers.memory import out_of_memory_is_cured_by
 from trainers.noise_prediction import NoisePrediction
 from trainers.pairs_on_disk import StereoPair
@@ -35,7 +35,6 @@ from zsdata.synthesis.inpaint.diffusion_parts import CELL_PX, load_diffusion_par
 MODEL = "an inpainting U-Net"
 PIPELINE = "pipeline"  # the folder in a checkpoint
 LOG_EVERY_STEPS = 10
-PREFETCHED_BATCHES = 2  # per worker
 WARM_UP_SHARE = 0.01  # of the one-cycle, as published
 
 
@@ -108,6 +107,7 @@ def tune(
     Raises:
         ValueError, OSError: a pipeline that cannot be used, a checkpoint of other data or options, or a rank that has other data.
         RuntimeError: the loss is not finite; it names the examples.
+        NoUsablePhoto, TooManyFaults, WorkerLost: examples cannot be made.
         MemoryError: the device's memory is too small; says what to lower.
     """
     run_folder.check_output(output, resume)
@@ -209,65 +209,55 @@ def tune(
     saved = output
     if training is None:
         validate(pipeline / subfolder)
-    batches = iter(_loader(examples, config, step, accelerator))
+    asked = requests(step, config.steps, config.batch_size, config.micro_batch, accelerator.process_index, accelerator.num_processes)
     progress = Progress(total=config.steps, initial=step, unit="step", disable=not accelerator.is_main_process, dynamic_ncols=True)
-    mark, waited = (step, time.perf_counter()), 0.0
-    while step < config.steps:
-        losses = []
-        for _ in range(accumulate):
-            begin = time.perf_counter()
-            batch: ExampleBatch = next(batches)
-            waited += time.perf_counter() - begin
-            faults.add(len(batch.requests), batch.rejected)
-            with accelerator.accumulate(model):
-                with accelerator.autocast():
-                    loss = prediction.loss(model, batch)
-                if not math.isfinite(loss.item()):
-                    raise RuntimeError(f"the loss is {loss.item()} at step {step}; examples: {', '.join(batch.places)}")
-                accelerator.backward(loss)
-                optimizer.step()
-                optimizer.zero_grad()
-            losses.append(loss.detach())
-        schedule.step()
-        step += 1
-        if average is not None:
-            average.update(unet, step)
-        progress.update()
-        if step % LOG_EVERY_STEPS == 0 or step == config.steps:
-            elapsed = time.perf_counter() - mark[1]
-            values = {
-                "loss": float(accelerator.reduce(torch.stack(losses).mean(), reduction="mean")),  # type: ignore[arg-type]
-                "learning_rate": schedule.get_last_lr()[0],
-                "examples_per_second": (step - mark[0]) * config.batch_size / elapsed,
-                "wait_share": waited / elapsed,
-            }
-            mark, waited = (step, time.perf_counter()), 0.0
-            reasons = refused()
-            progress.set_postfix_str(
-                f"loss {values['loss']:.4f}, {values['examples_per_second']:.1f} examples/s, waiting {values['wait_share']:.0%}"
-            )
-            if accelerator.is_main_process:
-                _append(output / "log.jsonl", {"step": step, **values, "refused": reasons})
-            accelerator.log({**values, "refused": sum(reasons.values())}, step=step)
-        if step % config.save_every == 0 or step == config.steps:
-            saved = save()
-            validate(saved)
+    with making(examples, asked, config.workers, accelerator.device) as batches:
+        mark, waited = (step, time.perf_counter()), 0.0
+        while step < config.steps:
+            losses = []
+            for _ in range(accumulate):
+                begin = time.perf_counter()
+                batch: ExampleBatch = next(batches)
+                waited += time.perf_counter() - begin
+                faults.add(len(batch.requests), batch.rejected)
+                with accelerator.accumulate(model):
+                    with accelerator.autocast():
+                        loss = prediction.loss(model, batch)
+                    if not math.isfinite(loss.item()):
+                        places = ", ".join(f"{meta['key']} in {meta['shard']}" for meta in batch.meta)
+                        raise RuntimeError(f"the loss is {loss.item()} at step {step}; examples: {places}")
+                    accelerator.backward(loss)
+                    optimizer.step()
+                    optimizer.zero_grad()
+                losses.append(loss.detach())
+            schedule.step()
+            step += 1
+            if average is not None:
+                average.update(unet, step)
+            progress.update()
+            if step % LOG_EVERY_STEPS == 0 or step == config.steps:
+                elapsed = time.perf_counter() - mark[1]
+                values = {
+                    "loss": float(accelerator.reduce(torch.stack(losses).mean(), reduction="mean")),  # type: ignore[arg-type]
+                    "learning_rate": schedule.get_last_lr()[0],
+                    "examples_per_second": (step - mark[0]) * config.batch_size / elapsed,
+                    "wait_share": waited / elapsed,
+                }
+                mark, waited = (step, time.perf_counter()), 0.0
+                reasons = refused()
+                progress.set_postfix_str(
+                    f"loss {values['loss']:.4f}, {values['examples_per_second']:.1f} examples/s, waiting {values['wait_share']:.0%}"
+                )
+                if accelerator.is_main_process:
+                    _append(output / "log.jsonl", {"step": step, **values, "refused": reasons})
+                accelerator.log({**values, "refused": sum(reasons.values())}, step=step)
+            if step % config.save_every == 0 or step == config.steps:
+                saved = save()
+                validate(saved)
     progress.close()
     accelerator.print(_summary(refused()))
     accelerator.end_training()
     return saved
-
-
-def _loader(examples: Examples, config: TuneConfig, step: int, accelerator: Accelerator) -> DataLoader:
-    asked = requests(step, config.steps, config.batch_size, config.micro_batch, accelerator.process_index, accelerator.num_processes)
-    return DataLoader(
-        examples,
-        batch_sampler=asked,  # type: ignore[arg-type]  # any iterable of lists of what the data set is asked for
-        num_workers=config.workers,
-        collate_fn=ExampleBatch.stack,
-        pin_memory=accelerator.device.type == "cuda",
-        prefetch_factor=PREFETCHED_BATCHES if config.workers else None,
-    )
 
 
 def _validation_cases(pairs: list[StereoPair] | None, examples: Examples, accelerator: Accelerator) -> list[HoleCase]:
