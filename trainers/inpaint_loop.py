@@ -5,17 +5,17 @@ A checkpoint is RUN/checkpoints/step-.../ with pipeline/, a whole pipeline in th
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from accelerate import Accelerator
 from accelerate.utils import gather_object
+from torch import Tensor
 
 from trainers import run_folder
 from trainers.hole_scores import HoleCase, hole_cases, mean_hole_scores, score_holes
@@ -25,6 +25,7 @@ from trainers.memory import out_of_memory_is_cured_by
 from trainers.noise_prediction import NoisePrediction
 from trainers.pairs_on_disk import StereoPair
 from trainers.pipeline_folder import UNET, frozen_digest, write_pipeline
+from trainers.step_guard import StepGuard
 from trainers.weight_average import WeightAverage, weights_of
 from zsdata.faults import FailureBudget, FaultLog
 from zsdata.position import Position, require_one_place
@@ -97,7 +98,8 @@ def tune(
     Args:
         pipeline: a local folder in the diffusers format, or one that holds it, with the card and the licence.
         examples: made for `config.seed` and `config.batch_size`.
-        output: the run's folder: checkpoints, tracker logs, log.jsonl, validation.jsonl. Refused where it holds those of another run.
+        output: the run's folder: checkpoints, tracker logs, log.jsonl, skipped.jsonl, validation.jsonl. Refused where it holds those of
+            another run.
         arguments: what the run was started with, saved with its state.
         subfolder: where in `pipeline` it lies.
         resume: a run's folder or one of its checkpoints.
@@ -106,7 +108,7 @@ def tune(
 
     Raises:
         ValueError, OSError: a pipeline that cannot be used, a checkpoint of other data or options, or a rank that has other data.
-        RuntimeError: the loss is not finite; it names the examples.
+        TrainingDiverged: too many steps in a row had to be skipped, because their loss was not finite or exploded.
         NoUsablePhoto, TooManyFaults, WorkerLost: examples cannot be made.
         MemoryError: the device's memory is too small; says what to lower.
     """
@@ -126,7 +128,7 @@ def tune(
 
     kept = {name: getattr(config, name) for name in ("steps", "learning_rate", "weight_decay", "ema")}
     options = {"model": MODEL, **kept, "the pipeline's digest": frozen_digest(pipeline / subfolder)}
-    unet, step, training, refused_before = parts.unet, 0, None, Counter[str]()
+    unet, step, training, state, refused_before = parts.unet, 0, None, {}, Counter[str]()
     if resume is not None:
         checkpoint = run_folder.newest(resume)
         training, state = run_folder.load(checkpoint)
@@ -161,6 +163,9 @@ def tune(
         accelerator.scaler.load_state_dict(training["scaler"])
     if average is not None:
         average.to(accelerator.device)
+    guard = StepGuard(accelerator, unet, output / "skipped.jsonl", hint="shard and key say where they lie")
+    if training is not None:
+        guard.load_state_dict(state["guard"])
 
     output.mkdir(parents=True, exist_ok=True)
     if tracker is not None:
@@ -190,6 +195,7 @@ def tune(
                         "examples": examples.position(step).to_state(),
                         "options": options,
                         "refused": refused_so_far,
+                        "guard": guard.state_dict(),
                         "world_size": accelerator.num_processes,
                         "arguments": arguments,
                     },
@@ -204,7 +210,7 @@ def tune(
             accelerator.log({f"hole_{name}": value for name, value in mean.items()}, step=step)
             accelerator.print(f"step {step}: holes of {len(scores)} pairs, PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.3f}")
             if accelerator.is_main_process:
-                _append(output / "validation.jsonl", {"step": step, "mean": mean, "pairs": scores})
+                run_folder.append(output / "validation.jsonl", {"step": step, "mean": mean, "pairs": scores})
 
     saved = output
     if training is None:
@@ -214,7 +220,7 @@ def tune(
     with making(examples, asked, config.workers, accelerator.device) as batches:
         mark, waited = (step, time.perf_counter()), 0.0
         while step < config.steps:
-            losses = []
+            skipped = False
             for _ in range(accumulate):
                 begin = time.perf_counter()
                 batch: ExampleBatch = next(batches)
@@ -223,22 +229,26 @@ def tune(
                 with accelerator.accumulate(model):
                     with accelerator.autocast():
                         loss = prediction.loss(model, batch)
-                    if not math.isfinite(loss.item()):
-                        places = ", ".join(f"{meta['key']} in {meta['shard']}" for meta in batch.meta)
-                        raise RuntimeError(f"the loss is {loss.item()} at step {step}; examples: {places}")
+                    guard.watch(loss, batch)
                     accelerator.backward(loss)
+                    if accelerator.sync_gradients:
+                        norm = accelerator.clip_grad_norm_(model.parameters(), math.inf)  # measures it, and clips nothing
+                        skipped = guard.refuses(step, cast(Tensor, norm))
+                        if skipped:
+                            optimizer.zero_grad()  # a step without gradients changes nothing
                     optimizer.step()
                     optimizer.zero_grad()
-                losses.append(loss.detach())
             schedule.step()
             step += 1
-            if average is not None:
+            if average is not None and not skipped:
                 average.update(unet, step)
             progress.update()
             if step % LOG_EVERY_STEPS == 0 or step == config.steps:
                 elapsed = time.perf_counter() - mark[1]
                 values = {
-                    "loss": float(accelerator.reduce(torch.stack(losses).mean(), reduction="mean")),  # type: ignore[arg-type]
+                    "loss": guard.loss,
+                    "gradient_norm": guard.gradient_norm,
+                    "skipped_steps": guard.skipped,
                     "learning_rate": schedule.get_last_lr()[0],
                     "examples_per_second": (step - mark[0]) * config.batch_size / elapsed,
                     "wait_share": waited / elapsed,
@@ -249,7 +259,7 @@ def tune(
                     f"loss {values['loss']:.4f}, {values['examples_per_second']:.1f} examples/s, waiting {values['wait_share']:.0%}"
                 )
                 if accelerator.is_main_process:
-                    _append(output / "log.jsonl", {"step": step, **values, "refused": reasons})
+                    run_folder.append(output / "log.jsonl", {"step": step, **values, "refused": reasons})
                 accelerator.log({**values, "refused": sum(reasons.values())}, step=step)
             if step % config.save_every == 0 or step == config.steps:
                 saved = save()
@@ -282,8 +292,3 @@ def _validate(folder: Path, cases: list[HoleCase], config: TuneConfig, accelerat
 def _summary(refused: dict[str, int]) -> str:
     reasons = ", ".join(f"{reason}: {count}" for reason, count in refused.items())
     return f"refused, and replaced by others: {reasons}" if refused else "no pair and no photo was refused"
-
-
-def _append(path: Path, values: dict[str, Any]) -> None:
-    with path.open("a") as file:
-        file.write(json.dumps(values) + "\n")

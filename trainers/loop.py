@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -280,7 +279,9 @@ def train(
                     )
                     if accelerator.is_main_process:
                         place = loader.state_dict()
-                        _append(output / "log.jsonl", {"step": step, "epoch": place["epoch"], "samples": place["samples"], **values})
+                        run_folder.append(
+                            output / "log.jsonl", {"step": step, "epoch": place["epoch"], "samples": place["samples"], **values}
+                        )
                     accelerator.log(values, step=step)
                 if validation.sets and config.evaluate_every is not None and step % config.evaluate_every == 0:
                     results = judge()
@@ -318,14 +319,7 @@ def _write_scores(output: Path, step: int, results: dict[str, list[dict[str, Any
     means = {name: one["mean"] for name, one in sets.items()}
     by_pair = {name: {one["name"]: one["all"][validation.best_by] for one in scores} for name, scores in results.items()}
     line = {"step": step, validation.best_by: validation.value(results), "means": means, f"{validation.best_by}_by_pair": by_pair}
-    _append(output / "evaluations.jsonl", line)
-
-
-def _append(path: Path, values: dict[str, Any]) -> None:
-    """One more line of JSON; what is not finite, which JSON does not know, is null."""
-    finite = {name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in values.items()}
-    with path.open("a") as file:
-        file.write(json.dumps(finite) + "\n")
+    run_folder.append(output / "evaluations.jsonl", line)
 
 
 class _Mark:

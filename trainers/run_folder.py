@@ -12,6 +12,7 @@ A folder belongs to one run: `check_output` refuses another one's, so that what 
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 from collections.abc import Callable
@@ -160,6 +161,13 @@ def require_options(checkpoint: Path, state: dict[str, Any], options: dict[str, 
                 f"{checkpoint} is of a run with {name} {begun.get(name)}, this one has {options.get(name)}; resume it as it was begun, "
                 f"or start a new run with {weights}"
             )
+
+
+def append(path: Path, values: dict[str, Any]) -> None:
+    """One more line of JSON; what is not finite, which JSON does not know, is null."""
+    finite = {name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in values.items()}
+    with path.open("a") as file:
+        file.write(json.dumps(finite) + "\n")
 
 
 def _replace(folder: Path, fill: Callable[[Path], Any]) -> Path:

@@ -27,6 +27,7 @@ from trainers.inpaint_loop import TuneConfig, tune
 from trainers.noise_prediction import NoisePrediction
 from trainers.pairs_on_disk import StereoPair
 from trainers.pipeline_folder import local_pipeline
+from trainers.step_guard import MOST_SKIPPED_IN_A_ROW, TrainingDiverged
 from trainers.weight_average import WeightAverage
 from zsdata import AdaptiveDisparity, ZeroStereoStream, load_inpainter
 from zsdata.faults import FaultLog
@@ -378,10 +379,33 @@ def test_a_rank_with_other_photos_is_named_before_the_first_step(pipeline, photo
         run(pipeline, examples_of(photos=photos), tmp_path / "run", config())
 
 
-def test_a_loss_that_is_not_finite_names_the_examples(pipeline, photos, tmp_path, monkeypatch):
-    monkeypatch.setattr(NoisePrediction, "loss", lambda self, model, batch: torch.tensor(float("nan"), requires_grad=True))
-    with pytest.raises(RuntimeError, match=r"the loss is nan at step 0; examples: 00000\d in .*photos.tar"):
-        run(pipeline, examples_of(photos=photos), tmp_path, config())
+def test_a_step_whose_loss_is_not_finite_changes_nothing_and_its_examples_are_written_down(pipeline, photos, tmp_path, monkeypatch):
+    asked = NoisePrediction.loss
+
+    def nan_in_step_two(self, model, batch):
+        return asked(self, model, batch) * (float("nan") if batch.requests[-1][0] == 2 else 1)
+
+    monkeypatch.setattr(NoisePrediction, "loss", nan_in_step_two)
+    examples, settings = examples_of(photos=photos), config(steps=4, save_every=1, ema=0.5, micro_batch=2)
+    saved = run(pipeline, examples, tmp_path / "run", settings)
+    own = [run_folder.load(saved.parent.with_name(f"step-0000000{step}"))[0]["weights"] for step in (2, 3, 4)]
+    assert all(torch.equal(own[0][name], weight) for name, weight in own[1].items())
+    assert any(not torch.equal(own[1][name], weight) for name, weight in own[2].items())
+    lines = [json.loads(line) for line in (tmp_path / "run" / "skipped.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [2, 2] and all(line["reason"].startswith("the loss is nan") for line in lines)
+    listed = [(sample["epoch"], sample["index"]) for line in lines for sample in line["samples"]]
+    assert listed == [examples.place(2, index) for index in range(4)] and lines[0]["samples"][0]["shard"] == str(photos)
+    resumed = run(pipeline, examples, tmp_path / "again", settings, resume=saved.parent.with_name("step-00000003"))
+    assert json.loads((tmp_path / "again" / "log.jsonl").read_text())["skipped_steps"] == 1
+    assert all(torch.equal(weights(resumed)[name], weight) for name, weight in weights(saved).items())
+
+
+def test_a_loss_that_stays_not_finite_is_an_error(pipeline, photos, tmp_path, monkeypatch):
+    monkeypatch.setattr(NoisePrediction, "loss", lambda self, model, batch: model.conv_in.weight.sum() * float("nan"))
+    with pytest.raises(
+        TrainingDiverged, match=rf"the loss is nan at step {MOST_SKIPPED_IN_A_ROW - 1}, .*skipped.jsonl lists .*Lower the learning"
+    ):
+        run(pipeline, examples_of(photos=photos), tmp_path, config(steps=20))
 
 
 @pytest.mark.filterwarnings("ignore:The built-in depth")
