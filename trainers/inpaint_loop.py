@@ -62,8 +62,9 @@ class TuneConfig:
                 raise ValueError(f"{name} is 1 or more; got {getattr(self, name)}")
         if self.learning_rate <= 0:
             raise ValueError(f"learning_rate is above 0; got {self.learning_rate}")
-        if self.workers < 0:
-            raise ValueError(f"workers is 0 or more; got {self.workers}")
+        for name in ("workers", "seed"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} is 0 or more; got {getattr(self, name)}")
         if self.ema is not None and not 0 < self.ema < 1:
             raise ValueError(f"ema is a decay in (0, 1), such as 0.9999; got {self.ema}")
 
@@ -120,8 +121,8 @@ def tune(
         project_dir=str(output),
     )
     accumulate = accelerator.gradient_accumulation_steps = config.accumulate(accelerator.num_processes)
-    if any(side % CELL_PX for side in examples.size):
-        raise ValueError(f"crops are multiples of {CELL_PX} px high and wide; got {examples.size}")
+    if any(side <= 0 or side % CELL_PX for side in examples.size):
+        raise ValueError(f"crops are multiples of {CELL_PX} px high and wide, {CELL_PX} or more; got {examples.size}")
     parts = load_diffusion_parts(str(pipeline), subfolder)
     prediction = NoisePrediction(parts, accelerator.device, config.seed)
     cases = _validation_cases(pairs, examples, accelerator)

@@ -17,6 +17,7 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import torch
@@ -132,9 +133,20 @@ def newest(path: Path) -> Path:
 
 
 def load(checkpoint: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """(training, state) of a checkpoint, as they were given to `save`; weights are loaded by `trainers.models.load_checkpoint`."""
-    training = torch.load(checkpoint / "training.pt", map_location="cpu", weights_only=True)
-    return training, json.loads((checkpoint / "state.json").read_text())
+    """(training, state) of a checkpoint, as they were given to `save`; weights are loaded by `trainers.models.load_checkpoint`.
+
+    Raises:
+        ValueError: a file of it is damaged; names it.
+        OSError: it is missing.
+    """
+    file = checkpoint / "training.pt"
+    try:
+        training = torch.load(file, map_location="cpu", weights_only=True)
+    except (EOFError, RuntimeError, UnpicklingError) as error:
+        raise ValueError(
+            f"{file} is damaged: it is cut off, or holds more than tensors and numbers; resume from another checkpoint"
+        ) from error
+    return training, _state(checkpoint)
 
 
 def require_options(checkpoint: Path, state: dict[str, Any], options: dict[str, Any], weights: str) -> None:
@@ -208,8 +220,17 @@ def _flush(path: Path) -> None:
         os.close(descriptor)
 
 
+def _state(checkpoint: Path) -> dict[str, Any]:
+    file = checkpoint / "state.json"
+    try:
+        state = json.loads(file.read_text())
+        return {"step": int(state["step"]), **state}
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{file} is damaged: {error!r}; resume from another checkpoint") from error
+
+
 def _step(checkpoint: Path) -> int:
-    return json.loads((checkpoint / "state.json").read_text())["step"]
+    return _state(checkpoint)["step"]
 
 
 def _is_whole(checkpoint: Path) -> bool:

@@ -242,6 +242,12 @@ def test_faults_in_the_tars_of_photos_are_told(photos, tmp_path, caplog):
     assert "1 faults in the tars of photos, the first:" in caplog.text
 
 
+def test_a_matchers_checkpoint_is_not_resumed(pipeline, photos, tmp_path):
+    run_folder.save(tmp_path / "raft", 1, torch.nn.Linear(1, 1), {}, {}, {"options": {"model": "raft_stereo"}})
+    with pytest.raises(ValueError, match=r"step-00000001 is of a run that trains raft_stereo; this one trains an inpainting U-Net"):
+        run(pipeline, examples_of(photos=photos), tmp_path / "run", config(), resume=tmp_path / "raft")
+
+
 def test_a_smaller_micro_batch_and_gradient_checkpointing_change_nothing_but_rounding(pipeline, photos, tmp_path):
     examples = examples_of(photos=photos)
     whole = weights(run(pipeline, examples, tmp_path / "whole", config(steps=2, learning_rate=1e-3)))
@@ -428,6 +434,7 @@ def test_a_device_that_is_too_small_is_one_line_that_says_what_to_lower(pipeline
         ({"steps": 0}, "steps is 1 or more; got 0"),
         ({"learning_rate": 0.0}, "learning_rate is above 0"),
         ({"workers": -1}, "workers is 0 or more"),
+        ({"seed": -1}, "seed is 0 or more; got -1"),
         ({"ema": 1.0}, r"decay in \(0, 1\)"),
     ],
 )
@@ -440,8 +447,9 @@ def test_the_batch_must_split_into_micro_batches(pipeline, photos, tmp_path):
     assert config(batch_size=32, micro_batch=4).accumulate(2) == 4
     with pytest.raises(ValueError, match="batch_size 4 is no multiple of micro_batch 3 times 1 ranks"):
         run(pipeline, examples_of(photos=photos), tmp_path, config(micro_batch=3))
-    with pytest.raises(ValueError, match=r"multiples of 8 px .* got \(60, 64\)"):
-        run(pipeline, examples_of(photos=photos, size=(60, 64)), tmp_path, config())
+    for size in ((60, 64), (0, 0), (-8, -8)):
+        with pytest.raises(ValueError, match=rf"multiples of 8 px .*, 8 or more; got {re.escape(str(size))}"):
+            run(pipeline, examples_of(photos=photos, size=size), tmp_path, config())
 
 
 def test_a_pipeline_is_found_in_the_hubs_cache_without_network(pipeline, tmp_path):
@@ -568,6 +576,7 @@ def test_the_command_tunes_on_two_ranks_as_on_one(pipeline, photos, things, tmp_
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        (["--output", "README.md"], "--output README.md is a file; name a folder"),
         ([], "nothing to learn from: name --photos or --datasets"),
         (["--photos", "nowhere.tar"], "nowhere.tar"),
         (["--depth-cache", "depth"], "--depth-cache keeps the depth of photos; name --photos, or leave it out"),

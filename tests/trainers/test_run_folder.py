@@ -142,3 +142,12 @@ def test_the_checkpoint_that_was_just_written_is_never_the_one_that_is_removed(t
         written = save(tmp_path, step, float(step))
         assert value_of(written) == step and written == run_folder.folder_of(tmp_path, step)
     assert len(list((tmp_path / "checkpoints").iterdir())) == run_folder.KEPT_CHECKPOINTS
+
+
+@pytest.mark.parametrize("file", ["training.pt", "state.json"])
+@pytest.mark.parametrize("content", [b"", b"{", b"PK\x03\x04 cut off"])
+def test_a_damaged_checkpoint_is_named_file_and_all(tmp_path, file, content):
+    folder = save(tmp_path, 1, 1.0)
+    (folder / file).write_bytes(content)
+    with pytest.raises(ValueError, match=rf"{folder}/{file} is damaged.*resume from another checkpoint"):
+        run_folder.load(folder)
