@@ -282,7 +282,7 @@ def _validate(folder: Path, cases: list[HoleCase], config: TuneConfig, accelerat
     mine = list(enumerate(cases))[accelerator.process_index :: accelerator.num_processes]
     scores = []
     if mine:
-        inpaint = load_inpainter(folder, accelerator.device, steps=config.validation_steps)
+        inpaint = load_inpainter(folder, accelerator.device, steps=config.validation_steps, micro_batch=1)  # one case at a time
         scores = [(number, score_holes(inpaint, case, number, config.seed)) for number, case in mine]
     return [score for _, score in sorted(gather_object(scores), key=lambda entry: entry[0])]
 

@@ -29,7 +29,7 @@ from trainers.noise_prediction import NoisePrediction
 from trainers.pairs_on_disk import StereoPair
 from trainers.pipeline_folder import local_pipeline
 from trainers.step_guard import MOST_SKIPPED_IN_A_ROW, TrainingDiverged
-from trainers.weight_average import WeightAverage
+from trainers.weight_average import WeightAverage, weights_of
 from zsdata import AdaptiveDisparity, ZeroStereoStream, load_inpainter
 from zsdata.faults import FaultLog
 from zsdata.source.manifest import build_manifest
@@ -308,10 +308,23 @@ def test_the_average_is_saved_and_the_training_goes_on_with_the_weights_themselv
     assert torch.allclose(average.weights[0], begin + 1 - 0.9 * 2 / 11)
 
 
-def test_real_pairs_are_judged_before_and_at_every_checkpoint(pipeline, photos, tmp_path, capsys):
+def test_the_weights_wait_on_the_cpu_while_the_average_stands_in_for_them():
+    """The meta device stands for a GPU here: a copy on it is made without a word, one to the CPU cannot be."""
+    network = torch.nn.Linear(3, 2, device="meta")
+    with pytest.raises(NotImplementedError, match="Cannot copy out of meta tensor"):
+        with weights_of(WeightAverage(network, 0.9), network):
+            pass
+
+
+def test_real_pairs_are_judged_before_and_at_every_checkpoint(pipeline, photos, tmp_path, capsys, monkeypatch):
     pairs = [real_pair(0), real_pair(1)]
     sparse = real_pair(2)._replace(name="sparse", valid=np.arange(96) % 2 == np.zeros((72, 1)))
+    sizes = []
+    monkeypatch.setattr(
+        inpaint_loop, "load_inpainter", lambda *a, **options: sizes.append(options["micro_batch"]) or load_inpainter(*a, **options)
+    )
     run(pipeline, examples_of(photos=photos), tmp_path, config(steps=4), pairs=[*pairs, sparse])
+    assert sizes == [1, 1, 1]  # no memory is measured for more: cases are judged one by one
     rows = [json.loads(line) for line in (tmp_path / "validation.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == [0, 2, 4]
     for row in rows:
