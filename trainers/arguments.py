@@ -9,6 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
+from trainers import run_folder
 from trainers.loop import LossFunction, TrainConfig, train
 from trainers.models import Matcher, load_checkpoint
 from trainers.models.checkpoint import WEIGHTS_FILE
@@ -146,7 +147,7 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
         help="a published or own checkpoint to start from: .pth, .safetensors, or a folder of a run",
     )
     training.add_argument(
-        "--output", type=Path, required=True, metavar="DIR", help="the run's folder: checkpoints, best, logs, evaluations"
+        "--output", type=Path, required=True, metavar="DIR", help="the run's own folder: checkpoints, best, logs, evaluations"
     )
     training.add_argument(
         "--resume", type=Path, metavar="DIR", help="go on from the newest checkpoint of that run, or from that checkpoint"
@@ -269,6 +270,7 @@ def leave_black(right: Tensor, inpaint_mask: Tensor, generators: Any) -> Tensor:
 
 def train_as_told(arguments: argparse.Namespace, matcher: Matcher, loss_function: LossFunction, name: str, options: dict[str, Any]) -> None:
     """Trains a fresh `matcher`, called `name` and built with `options`, as the command line says."""
+    run_folder.check_output(arguments.output, arguments.resume)  # before any photo is read
     matcher.freeze_bn()
     if arguments.initial_weights is not None:
         weights = arguments.initial_weights

@@ -1,7 +1,7 @@
 """Fine-tunes a diffusion inpainting model on the holes that stereo leaves: what a right camera sees and the left one does not.
 
 accelerate launch trainers/inpaint.py --pipeline sd2-community/stable-diffusion-2-inpainting --photos "shards/*.tar" \\
-    --depth depth-anything/Depth-Anything-V2-Small-hf --mixed-precision bf16 --output runs/inpaint
+    --depth depth-anything/Depth-Anything-V2-Small-hf --depth-cache depth --mixed-precision bf16 --output runs/inpaint
 accelerate launch trainers/inpaint.py --pipeline sd2-community/stable-diffusion-2-inpainting \\
     --datasets sceneflow-final=data/sceneflow tartanair=data/tartanair crestereo=data/crestereo vkitti2=data/vkitti2 --output runs/inpaint
 
@@ -23,7 +23,8 @@ Where the examples come from
                  .png of 16 bits, 256 times the disparity), optionally KEY.disp_right.*.
 
 The pipelines: sd2-community/stable-diffusion-2-inpainting (Open RAIL++) is a mirror of Stability AI's repository, which is gone; the
-paper's own fine-tuned model is Windsrain/ZeroStereo with --subfolder StereoGen. A local folder works as well.
+paper's own fine-tuned model is Windsrain/ZeroStereo with --subfolder StereoGen. A local folder works as well. What is needed:
+pip install "zsdata[depth,diffusion,tensorboard]".
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from trainers import run_folder
 from trainers.arguments import run
 from trainers.inpaint_data.layouts import LAYOUTS, StereoFolder
 from trainers.inpaint_data.sources import Examples, PhotoSource, Source, StereoSource
@@ -46,6 +48,7 @@ TARS = "tars"
 
 def main() -> None:
     arguments = _parser().parse_args()
+    run_folder.check_output(arguments.output, arguments.resume)  # before any photo is read
     names = (
         "steps",
         "batch_size",
@@ -65,6 +68,7 @@ def main() -> None:
         local_pipeline(arguments.pipeline, arguments.subfolder, arguments.revision),
         examples,
         config,
+        subfolder=arguments.subfolder,
         output=arguments.output,
         arguments={argument: str(value) for argument, value in vars(arguments).items()},
         resume=arguments.resume,
@@ -89,7 +93,9 @@ def open_sources(arguments: argparse.Namespace) -> dict[str, Source]:
             raise ValueError(f"{kind} is named twice; put both below one folder, or give a pattern of tars")
         sources[kind] = StereoSource(StereoTars(where) if kind == TARS else StereoFolder(kind, where))
     if arguments.photos:
-        sources["photos"] = PhotoSource(build_manifest(arguments.photos), arguments.depth, AdaptiveDisparity())
+        sources["photos"] = PhotoSource(build_manifest(arguments.photos), arguments.depth, AdaptiveDisparity(), arguments.depth_cache)
+    elif arguments.depth_cache is not None:
+        raise ValueError("--depth-cache keeps the depth of photos; name --photos, or leave it out")
     if not sources:
         raise ValueError("nothing to learn from: name --photos or --datasets (or both)")
     return sources
@@ -121,7 +127,14 @@ def _parser() -> argparse.ArgumentParser:
     data.add_argument(
         "--depth",
         default="builtin",
-        help='for photos: "builtin", a Hub id or folder in the transformers format, or "stored", the maps beside them (default: builtin)',
+        help='for photos: "builtin", a Hub id or folder in the transformers format, or "stored", the maps beside them in the tars, where '
+        "`zsdata pack` puts NAME.depth.npy or NAME.depth.png with NAME.jpg (default: builtin)",
+    )
+    data.add_argument(
+        "--depth-cache",
+        metavar="DIR",
+        help="keep each photo's depth there: it is estimated once, not once per epoch on one CPU thread; a matcher's trainer that was "
+        "given this folder and --depth has filled it already",
     )
     data.add_argument("--datasets", nargs="+", default=[], metavar="KIND=FOLDER", help="synthetic stereo, see above")
     data.add_argument(
@@ -154,7 +167,9 @@ def _parser() -> argparse.ArgumentParser:
         "--ema", type=float, metavar="DECAY", help="save and judge a moving average of the weights, such as 0.9999 (default: none)"
     )
     training.add_argument("--mixed-precision", choices=("no", "bf16", "fp16"), help="default: what `accelerate launch` was told")
-    training.add_argument("--output", type=Path, required=True, metavar="DIR", help="the run's folder: checkpoints, logs, validation.jsonl")
+    training.add_argument(
+        "--output", type=Path, required=True, metavar="DIR", help="the run's own folder: checkpoints, logs, validation.jsonl"
+    )
     training.add_argument(
         "--resume", type=Path, metavar="DIR", help="go on from the newest checkpoint of that run, or from that checkpoint"
     )

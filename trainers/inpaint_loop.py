@@ -5,24 +5,28 @@ A checkpoint is RUN/checkpoints/step-.../ with pipeline/, a whole pipeline in th
 
 from __future__ import annotations
 
-import json
 import math
 import time
+from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from accelerate import Accelerator
 from accelerate.utils import gather_object
-from torch.utils.data import DataLoader
+from torch import Tensor
 
 from trainers import run_folder
+from trainers.accelerated import open_accelerator
 from trainers.hole_scores import HoleCase, hole_cases, mean_hole_scores, score_holes
-from trainers.inpaint_data.sources import ExampleBatch, Examples, requests
+from trainers.inpaint_data.batches import making, requests
+from trainers.inpaint_data.sources import ExampleBatch, Examples
+from trainers.memory import out_of_memory_is_cured_by
 from trainers.noise_prediction import NoisePrediction
 from trainers.pairs_on_disk import StereoPair
-from trainers.pipeline_folder import UNET, write_pipeline
+from trainers.pipeline_folder import UNET, frozen_digest, write_pipeline
+from trainers.step_guard import StepGuard
 from trainers.weight_average import WeightAverage, weights_of
 from zsdata.faults import FailureBudget, FaultLog
 from zsdata.position import Position, require_one_place
@@ -30,9 +34,9 @@ from zsdata.progress import Progress
 from zsdata.synthesis.inpaint import load_inpainter
 from zsdata.synthesis.inpaint.diffusion_parts import CELL_PX, load_diffusion_parts
 
+MODEL = "an inpainting U-Net"
 PIPELINE = "pipeline"  # the folder in a checkpoint
 LOG_EVERY_STEPS = 10
-PREFETCHED_BATCHES = 2  # per worker
 WARM_UP_SHARE = 0.01  # of the one-cycle, as published
 
 
@@ -59,8 +63,9 @@ class TuneConfig:
                 raise ValueError(f"{name} is 1 or more; got {getattr(self, name)}")
         if self.learning_rate <= 0:
             raise ValueError(f"learning_rate is above 0; got {self.learning_rate}")
-        if self.workers < 0:
-            raise ValueError(f"workers is 0 or more; got {self.workers}")
+        for name in ("workers", "seed"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} is 0 or more; got {getattr(self, name)}")
         if self.ema is not None and not 0 < self.ema < 1:
             raise ValueError(f"ema is a decay in (0, 1), such as 0.9999; got {self.ema}")
 
@@ -74,6 +79,7 @@ class TuneConfig:
         return self.batch_size // at_once
 
 
+@out_of_memory_is_cured_by("lower --micro-batch, add --gradient-checkpointing or --mixed-precision bf16, or lower --size")
 def tune(
     pipeline: Path,
     examples: Examples,
@@ -81,6 +87,7 @@ def tune(
     *,
     output: Path,
     arguments: dict[str, Any],
+    subfolder: str = "",
     resume: Path | None = None,
     pairs: list[StereoPair] | None = None,
     tracker: str | None = "tensorboard",
@@ -91,36 +98,40 @@ def tune(
     stopped, and other numbers of ranks or another micro_batch change it only by rounding.
 
     Args:
-        pipeline: a local folder in the diffusers format.
+        pipeline: a local folder in the diffusers format, or one that holds it, with the card and the licence.
         examples: made for `config.seed` and `config.batch_size`.
-        output: the run's folder: checkpoints, tracker logs, log.jsonl, validation.jsonl.
+        output: the run's folder: checkpoints, tracker logs, log.jsonl, skipped.jsonl, validation.jsonl. Refused where it holds those of
+            another run.
         arguments: what the run was started with, saved with its state.
+        subfolder: where in `pipeline` it lies.
         resume: a run's folder or one of its checkpoints.
         pairs: stereo pairs with dense ground truth; their holes are filled and judged before the first step and at every checkpoint.
         tracker: any of Accelerate's, or None.
 
     Raises:
-        ValueError, OSError: a pipeline that cannot be used, a checkpoint of other data or options, or a rank that has other data.
-        RuntimeError: the loss is not finite; it names the examples.
+        ValueError, ImportError, OSError: options, a tracker or a pipeline that cannot be used, an output that is another run's, a
+            checkpoint of other data or options, or a rank that has other data.
+        TrainingDiverged: too many steps in a row had to be skipped, because their loss was not finite or exploded.
+        NoUsablePhoto, TooManyFaults, WorkerLost: examples cannot be made.
+        MemoryError: the device's memory is too small; says what to lower.
     """
-    accelerator = Accelerator(
-        cpu=not torch.accelerator.is_available(),  # without it, ranks that torchrun starts on a CPU do not find each other
-        mixed_precision=config.mixed_precision,
-        log_with=tracker,
-        project_dir=str(output),
-    )
+    run_folder.check_output(output, resume)
+    accelerator = open_accelerator(config.mixed_precision, tracker, output)
     accumulate = accelerator.gradient_accumulation_steps = config.accumulate(accelerator.num_processes)
-    if any(side % CELL_PX for side in examples.size):
-        raise ValueError(f"crops are multiples of {CELL_PX} px high and wide; got {examples.size}")
-    parts = load_diffusion_parts(str(pipeline))
+    if any(side <= 0 or side % CELL_PX for side in examples.size):
+        raise ValueError(f"crops are multiples of {CELL_PX} px high and wide, {CELL_PX} or more; got {examples.size}")
+    parts = load_diffusion_parts(str(pipeline), subfolder)
     prediction = NoisePrediction(parts, accelerator.device, config.seed)
     cases = _validation_cases(pairs, examples, accelerator)
 
-    unet, step, training = parts.unet, 0, None
+    kept = {name: getattr(config, name) for name in ("steps", "learning_rate", "weight_decay", "ema")}
+    options = {"model": MODEL, **kept, "the pipeline's digest": frozen_digest(pipeline / subfolder)}
+    unet, step, training, state, refused_before = parts.unet, 0, None, {}, Counter[str]()
     if resume is not None:
         checkpoint = run_folder.newest(resume)
         training, state = run_folder.load(checkpoint)
-        step = state["step"]
+        run_folder.require_options(checkpoint, state, options, f"--pipeline {checkpoint / PIPELINE}")
+        step, refused_before = state["step"], Counter(state["refused"])
         if step >= config.steps:
             raise ValueError(f"{checkpoint} has all of the {config.steps} steps already")
         Position.from_state(state["examples"], examples.position(step))
@@ -143,8 +154,6 @@ def tune(
         anneal_strategy="linear",
     )
     if training is not None:
-        if training["schedule"]["total_steps"] != config.steps + 1:
-            raise ValueError(f"the run was planned for {training['schedule']['total_steps'] - 1} steps; resume it with that --steps")
         optimizer.load_state_dict(training["optimizer"])
         schedule.load_state_dict(training["schedule"])
     model, optimizer = accelerator.prepare(unet, optimizer)
@@ -152,28 +161,45 @@ def tune(
         accelerator.scaler.load_state_dict(training["scaler"])
     if average is not None:
         average.to(accelerator.device)
+    guard = StepGuard(accelerator, unet, output / "skipped.jsonl", hint="shard and key say where they lie")
+    if training is not None:
+        guard.load_state_dict(state["guard"])
 
     output.mkdir(parents=True, exist_ok=True)
     if tracker is not None:
         accelerator.init_trackers(output.name or "run", {name: value for name, value in asdict(config).items() if value is not None})
 
+    faults = FaultLog(FailureBudget(), ranks=accelerator.num_processes)
+
+    def refused() -> dict[str, int]:
+        """Pairs and photos that could not be used, by reason, of all ranks and since the run began."""
+        return dict(sum(gather_object([faults.by_reason]), start=refused_before))
+
     def save() -> Path:
+        refused_so_far = refused()
         if accelerator.is_main_process:
             with weights_of(average, unet) as raw:
                 run_folder.write(
                     output,
                     step,
-                    lambda folder: write_pipeline(folder / PIPELINE, unet, pipeline),
+                    lambda folder: write_pipeline(folder / PIPELINE, unet, pipeline, subfolder),
                     {
                         "weights": raw,
                         "optimizer": optimizer.state_dict(),
                         "schedule": schedule.state_dict(),
                         "scaler": accelerator.scaler.state_dict() if accelerator.scaler is not None else {},
                     },
-                    {"examples": examples.position(step).to_state(), "world_size": accelerator.num_processes, "arguments": arguments},
+                    {
+                        "examples": examples.position(step).to_state(),
+                        "options": options,
+                        "refused": refused_so_far,
+                        "guard": guard.state_dict(),
+                        "world_size": accelerator.num_processes,
+                        "arguments": arguments,
+                    },
                 )
         accelerator.wait_for_everyone()
-        return run_folder.newest(output) / PIPELINE
+        return run_folder.folder_of(output, step) / PIPELINE
 
     def validate(folder: Path) -> None:
         if cases:
@@ -182,69 +208,64 @@ def tune(
             accelerator.log({f"hole_{name}": value for name, value in mean.items()}, step=step)
             accelerator.print(f"step {step}: holes of {len(scores)} pairs, PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.3f}")
             if accelerator.is_main_process:
-                _append(output / "validation.jsonl", {"step": step, "mean": mean, "pairs": scores})
+                run_folder.append(output / "validation.jsonl", {"step": step, "mean": mean, "pairs": scores})
 
     saved = output
     if training is None:
-        validate(pipeline)
-    faults = FaultLog(FailureBudget())
-    batches = iter(_loader(examples, config, step, accelerator))
+        validate(pipeline / subfolder)
+    asked = requests(step, config.steps, config.batch_size, config.micro_batch, accelerator.process_index, accelerator.num_processes)
     progress = Progress(total=config.steps, initial=step, unit="step", disable=not accelerator.is_main_process, dynamic_ncols=True)
-    mark, waited = (step, time.perf_counter()), 0.0
-    while step < config.steps:
-        losses = []
-        for _ in range(accumulate):
-            begin = time.perf_counter()
-            batch: ExampleBatch = next(batches)
-            waited += time.perf_counter() - begin
-            faults.add(len(batch.requests), batch.rejected)
-            with accelerator.accumulate(model):
-                with accelerator.autocast():
-                    loss = prediction.loss(model, batch)
-                if not math.isfinite(loss.item()):
-                    raise RuntimeError(f"the loss is {loss.item()} at step {step}; examples: {', '.join(batch.places)}")
-                accelerator.backward(loss)
-                optimizer.step()
-                optimizer.zero_grad()
-            losses.append(loss.detach())
-        schedule.step()
-        step += 1
-        if average is not None:
-            average.update(unet, step)
-        progress.update()
-        if step % LOG_EVERY_STEPS == 0 or step == config.steps:
-            elapsed = time.perf_counter() - mark[1]
-            values = {
-                "loss": float(accelerator.reduce(torch.stack(losses).mean(), reduction="mean")),  # type: ignore[arg-type]
-                "learning_rate": schedule.get_last_lr()[0],
-                "examples_per_second": (step - mark[0]) * config.batch_size / elapsed,
-                "wait_share": waited / elapsed,
-            }
-            mark, waited = (step, time.perf_counter()), 0.0
-            progress.set_postfix_str(
-                f"loss {values['loss']:.4f}, {values['examples_per_second']:.1f} examples/s, waiting {values['wait_share']:.0%}"
-            )
-            if accelerator.is_main_process:
-                _append(output / "log.jsonl", {"step": step, **values})
-            accelerator.log(values, step=step)
-        if step % config.save_every == 0 or step == config.steps:
-            saved = save()
-            validate(saved)
+    with making(examples, asked, config.workers, accelerator.device) as batches:
+        mark, waited = (step, time.perf_counter()), 0.0
+        while step < config.steps:
+            skipped = False
+            for _ in range(accumulate):
+                begin = time.perf_counter()
+                batch: ExampleBatch = next(batches)
+                waited += time.perf_counter() - begin
+                faults.add(len(batch.requests), batch.rejected)
+                with accelerator.accumulate(model):
+                    with accelerator.autocast():
+                        loss = prediction.loss(model, batch)
+                    guard.watch(loss, batch)
+                    accelerator.backward(loss)
+                    if accelerator.sync_gradients:
+                        norm = accelerator.clip_grad_norm_(model.parameters(), math.inf)  # measures it, and clips nothing
+                        skipped = guard.refuses(step, cast(Tensor, norm))
+                        if skipped:
+                            optimizer.zero_grad()  # a step without gradients changes nothing
+                    optimizer.step()
+                    optimizer.zero_grad()
+            schedule.step()
+            step += 1
+            if average is not None and not skipped:
+                average.update(unet, step)
+            progress.update()
+            if step % LOG_EVERY_STEPS == 0 or step == config.steps:
+                elapsed = time.perf_counter() - mark[1]
+                values = {
+                    "loss": guard.loss,
+                    "gradient_norm": guard.gradient_norm,
+                    "skipped_steps": guard.skipped,
+                    "learning_rate": schedule.get_last_lr()[0],
+                    "examples_per_second": (step - mark[0]) * config.batch_size / elapsed,
+                    "wait_share": waited / elapsed,
+                }
+                mark, waited = (step, time.perf_counter()), 0.0
+                reasons = refused()
+                progress.set_postfix_str(
+                    f"loss {values['loss']:.4f}, {values['examples_per_second']:.1f} examples/s, waiting {values['wait_share']:.0%}"
+                )
+                if accelerator.is_main_process:
+                    run_folder.append(output / "log.jsonl", {"step": step, **values, "refused": reasons})
+                accelerator.log({**values, "refused": sum(reasons.values())}, step=step)
+            if step % config.save_every == 0 or step == config.steps:
+                saved = save()
+                validate(saved)
     progress.close()
+    accelerator.print(_summary(refused()))
     accelerator.end_training()
     return saved
-
-
-def _loader(examples: Examples, config: TuneConfig, step: int, accelerator: Accelerator) -> DataLoader:
-    asked = requests(step, config.steps, config.batch_size, config.micro_batch, accelerator.process_index, accelerator.num_processes)
-    return DataLoader(
-        examples,
-        batch_sampler=asked,  # type: ignore[arg-type]  # any iterable of lists of what the data set is asked for
-        num_workers=config.workers,
-        collate_fn=ExampleBatch.stack,
-        pin_memory=accelerator.device.type == "cuda",
-        prefetch_factor=PREFETCHED_BATCHES if config.workers else None,
-    )
 
 
 def _validation_cases(pairs: list[StereoPair] | None, examples: Examples, accelerator: Accelerator) -> list[HoleCase]:
@@ -261,11 +282,11 @@ def _validate(folder: Path, cases: list[HoleCase], config: TuneConfig, accelerat
     mine = list(enumerate(cases))[accelerator.process_index :: accelerator.num_processes]
     scores = []
     if mine:
-        inpaint = load_inpainter(folder, accelerator.device, steps=config.validation_steps)
+        inpaint = load_inpainter(folder, accelerator.device, steps=config.validation_steps, micro_batch=1)  # one case at a time
         scores = [(number, score_holes(inpaint, case, number, config.seed)) for number, case in mine]
     return [score for _, score in sorted(gather_object(scores), key=lambda entry: entry[0])]
 
 
-def _append(path: Path, values: dict[str, Any]) -> None:
-    with path.open("a") as file:
-        file.write(json.dumps(values) + "\n")
+def _summary(refused: dict[str, int]) -> str:
+    reasons = ", ".join(f"{reason}: {count}" for reason, count in refused.items())
+    return f"refused, and replaced by others: {reasons}" if refused else "no pair and no photo was refused"

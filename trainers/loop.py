@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import json
-import math
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
 
 import torch
-from accelerate import Accelerator
 from accelerate.tracking import GeneralTracker
 from accelerate.utils import gather_object
 from torch import Tensor
 
 from trainers import run_folder
+from trainers.accelerated import open_accelerator
 from trainers.evaluate import mean_scores, table
+from trainers.memory import out_of_memory_is_cured_by
 from trainers.models import Matcher, load_checkpoint
 from trainers.models.checkpoint import WEIGHTS_FILE
 from trainers.provenance import provenance
@@ -38,6 +37,7 @@ RECONSTRUCT_EVERY_STEPS = 100  # how well the pairs and their labels fit togethe
 # RAFT-Stereo's schedule: a linear one-cycle that warms up for 1 % of the steps and is 100 steps longer than the training.
 WARM_UP_SHARE = 0.01
 SPARE_SCHEDULE_STEPS = 100
+SAME_NUMBERS = ("corr_implementation",)  # options of a matcher that change its memory and nothing else
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +74,9 @@ class TrainConfig:
             raise ValueError(f"ema is a decay in (0, 1), such as 0.999; got {self.ema}")
 
 
+@out_of_memory_is_cured_by(
+    "lower --batch-size (and raise --accumulate by as much), add --mixed-precision bf16, or lower --size or --iterations"
+)
 def train(
     matcher: Matcher,
     loss_function: LossFunction,
@@ -94,7 +97,8 @@ def train(
 
     Args:
         loss_function: (initial prediction, sequence of predictions, batch) -> (loss, metrics).
-        output: the run's folder: checkpoints, best, tracker logs, log.jsonl, skipped.jsonl, evaluations.jsonl, evaluation.json.
+        output: the run's folder: checkpoints, best, tracker logs, log.jsonl, skipped.jsonl, evaluations.jsonl, evaluation.json. Refused
+            where it holds the checkpoints of another run.
         model_config: {"model": name, "options": {...}}, saved with the weights.
         arguments: what the run was started with, saved with its state.
         resume: a run's folder or one of its checkpoints.
@@ -103,19 +107,12 @@ def train(
         tracker: any of Accelerate's by name, one of your own, or None.
     Raises:
         ValueError, ImportError, OSError: options, a tracker or a checkpoint that cannot be used, or a rank that has other photos.
+        MemoryError: the device's memory is too small; says what to lower.
         TrainingDiverged: too many steps in a row had to be skipped.
     """
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "`log_with=")  # said as an error below
-        accelerator = Accelerator(
-            cpu=not torch.accelerator.is_available(),  # without it, ranks that torchrun starts on a CPU do not find each other
-            mixed_precision=config.mixed_precision,
-            gradient_accumulation_steps=config.accumulate,
-            log_with=tracker,
-            project_dir=str(output),
-        )
-    if tracker is not None and not accelerator.log_with:
-        raise ImportError(f"the tracker {tracker} is not installed: pip install {tracker}, or leave it out")
+    run_folder.check_output(output, resume)
+    accelerator = open_accelerator(config.mixed_precision, tracker, output)
+    accelerator.gradient_accumulation_steps = config.accumulate
     validation = Validation(sets, config.best_by)
     if config.channels_last:
         matcher.use_channels_last()
@@ -138,16 +135,12 @@ def train(
         world_size=accelerator.num_processes,
     )
     output.mkdir(parents=True, exist_ok=True)
+    options = _options_of_a_run(config, model_config)
     step, training, state = 0, None, {}
     if resume is not None:
         checkpoint = run_folder.newest(resume)
         training, state = run_folder.load(checkpoint)
-        planned = training["schedule"]["total_steps"] - SPARE_SCHEDULE_STEPS
-        if planned != config.steps:
-            raise ValueError(
-                f"{checkpoint} is of a run of {planned} steps, which its learning rate follows; resume it with --steps {planned}, "
-                f"or start a new run with --initial-weights {checkpoint / WEIGHTS_FILE}"
-            )
+        run_folder.require_options(checkpoint, state, options, f"--initial-weights {checkpoint / WEIGHTS_FILE}")
         load_checkpoint(matcher, checkpoint / WEIGHTS_FILE)
     average = None if config.ema is None else WeightAverage(matcher, config.ema)
     if training is not None:
@@ -192,6 +185,7 @@ def train(
                         "stream": loader.state_dict(),
                         "validation": validation.state_dict(),
                         "guard": guard.state_dict(),
+                        "options": options,
                         "world_size": accelerator.num_processes,
                         "arguments": arguments,
                         "provenance": provenance(stream, arguments),
@@ -275,7 +269,9 @@ def train(
                     )
                     if accelerator.is_main_process:
                         place = loader.state_dict()
-                        _append(output / "log.jsonl", {"step": step, "epoch": place["epoch"], "samples": place["samples"], **values})
+                        run_folder.append(
+                            output / "log.jsonl", {"step": step, "epoch": place["epoch"], "samples": place["samples"], **values}
+                        )
                     accelerator.log(values, step=step)
                 if validation.sets and config.evaluate_every is not None and step % config.evaluate_every == 0:
                     results = judge()
@@ -294,6 +290,13 @@ def train(
     return results
 
 
+def _options_of_a_run(config: TrainConfig, model_config: dict[str, Any]) -> dict[str, Any]:
+    """What cannot change when a run is resumed, in plain JSON."""
+    network = {name: value for name, value in model_config.get("options", {}).items() if name not in SAME_NUMBERS}
+    kept = {name: getattr(config, name) for name in ("steps", "learning_rate", "weight_decay", "ema")}
+    return json.loads(json.dumps({"model": model_config.get("model"), **network, **kept}))
+
+
 def _reconstruction(batch: StereoBatch) -> dict[str, Tensor]:
     """How well the pairs and their labels fit together, as in the paper's table: every pixel counts."""
     errors = reconstruction_error(batch.left_clean, batch.right_clean, batch.disparity)
@@ -306,14 +309,7 @@ def _write_scores(output: Path, step: int, results: dict[str, list[dict[str, Any
     means = {name: one["mean"] for name, one in sets.items()}
     by_pair = {name: {one["name"]: one["all"][validation.best_by] for one in scores} for name, scores in results.items()}
     line = {"step": step, validation.best_by: validation.value(results), "means": means, f"{validation.best_by}_by_pair": by_pair}
-    _append(output / "evaluations.jsonl", line)
-
-
-def _append(path: Path, values: dict[str, Any]) -> None:
-    """One more line of JSON; what is not finite, which JSON does not know, is null."""
-    finite = {name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in values.items()}
-    with path.open("a") as file:
-        file.write(json.dumps(finite) + "\n")
+    run_folder.append(output / "evaluations.jsonl", line)
 
 
 class _Mark:

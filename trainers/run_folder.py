@@ -5,15 +5,19 @@ OUTPUT/checkpoints/step-00000500/model.safetensors    weights under their publis
                                  training.pt          optimizer, schedule and gradient scaler (tensors and numbers only)
                                  state.json           step, place in the stream, the run's arguments
 OUTPUT/best/                                          the checkpoint that was judged best, of the same files
+
+A folder belongs to one run: `check_output` refuses another one's, so that what `write` removes is always the run's own.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import torch
@@ -24,6 +28,40 @@ from trainers.models.checkpoint import WEIGHTS_FILE
 
 KEPT_CHECKPOINTS = 3
 HIDDEN = ".unfinished"  # ends the names of folders that are being written or removed; what a killed run leaves of them is no checkpoint
+
+
+def check_output(output: Path, resume: Path | None) -> None:
+    """Refuses an output in which a run would come upon checkpoints other than those that it goes on from.
+
+    To be called before anything slow, and before any rank may have written its first checkpoint.
+
+    Raises:
+        FileExistsError: there are such checkpoints; names them and the way out.
+        NotADirectoryError: the output is a file.
+        FileNotFoundError: no checkpoint to resume from.
+    """
+    if output.exists() and not output.is_dir():
+        raise NotADirectoryError(f"--output {output} is a file; name a folder")
+    start = None if resume is None else newest(resume)
+    there = [*_whole(output), *([output / "best"] if _is_whole(output / "best") else [])]
+    if not there:
+        return
+    last = max(there, key=_step)
+    if start is None:
+        raise FileExistsError(
+            f"{output} holds the checkpoints of an earlier run, up to step {_step(last)}: --resume {output} goes on with it; "
+            "or give another --output"
+        )
+    if not start.resolve().is_relative_to(output.resolve()):
+        raise FileExistsError(
+            f"{output} holds the checkpoints of another run than {start}, up to step {_step(last)}: --resume {output} goes on with "
+            "that one; or give another --output"
+        )
+    if _step(start) < _step(last):
+        raise FileExistsError(
+            f"{output} holds a later checkpoint than {start}: {last}, of step {_step(last)}. Give another --output, or move the later ones "
+            f"away; --resume {output} goes on from the last one"
+        )
 
 
 def save(output: Path, step: int, matcher: nn.Module, config: dict[str, Any], training: dict[str, Any], state: dict[str, Any]) -> Path:
@@ -38,7 +76,7 @@ def save(output: Path, step: int, matcher: nn.Module, config: dict[str, Any], tr
 
 def write(output: Path, step: int, weights: Callable[[Path], None], training: dict[str, Any], state: dict[str, Any]) -> Path:
     """As `save`, for any network: `weights(folder)` writes its files."""
-    folder = output / "checkpoints" / f"step-{step:08d}"
+    folder = folder_of(output, step)
     folder.parent.mkdir(parents=True, exist_ok=True)
 
     def fill(unfinished: Path) -> None:
@@ -48,9 +86,15 @@ def write(output: Path, step: int, weights: Callable[[Path], None], training: di
         (unfinished / "state.json").write_text(json.dumps({"step": step, **state}, indent=2) + "\n")
 
     _replace(folder, fill)
-    for old in _whole(output)[:-KEPT_CHECKPOINTS]:
+    others = [path for path in _whole(output) if path != folder]
+    for old in others[: -(KEPT_CHECKPOINTS - 1)]:
         shutil.rmtree(_hide(old))
     return folder
+
+
+def folder_of(output: Path, step: int) -> Path:
+    """The folder of the checkpoint of `step`."""
+    return output / "checkpoints" / f"step-{step:08d}"
 
 
 def keep_best(checkpoint: Path, output: Path) -> Path:
@@ -78,7 +122,7 @@ def newest(path: Path) -> Path:
     Raises:
         FileNotFoundError: there is none.
     """
-    if (path / "state.json").is_file():
+    if _is_whole(path):
         return path
     checkpoints = _whole(path)
     if not checkpoints:
@@ -89,9 +133,53 @@ def newest(path: Path) -> Path:
 
 
 def load(checkpoint: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """(training, state) of a checkpoint, as they were given to `save`; weights are loaded by `trainers.models.load_checkpoint`."""
-    training = torch.load(checkpoint / "training.pt", map_location="cpu", weights_only=True)
-    return training, json.loads((checkpoint / "state.json").read_text())
+    """(training, state) of a checkpoint, as they were given to `save`; weights are loaded by `trainers.models.load_checkpoint`.
+
+    Raises:
+        ValueError: a file of it is damaged; names it.
+        OSError: it is missing.
+    """
+    file = checkpoint / "training.pt"
+    try:
+        training = torch.load(file, map_location="cpu", weights_only=True)
+    except (EOFError, RuntimeError, UnpicklingError) as error:
+        raise ValueError(
+            f"{file} is damaged: it is cut off, or holds more than tensors and numbers; resume from another checkpoint"
+        ) from error
+    return training, _state(checkpoint)
+
+
+def require_options(checkpoint: Path, state: dict[str, Any], options: dict[str, Any], weights: str) -> None:
+    """Checks that a run is resumed with what cannot change on its way, and would be left out or mixed without a word.
+
+    Args:
+        state: of the checkpoint; has the options that its run was begun with under "options".
+        options: of this run, in plain JSON; "model" is what is trained.
+        weights: how a new run starts from this checkpoint's weights.
+
+    Raises:
+        ValueError: names the option that differs, what it was and what it is.
+    """
+    begun = state.get("options")
+    if begun is None:
+        raise ValueError(
+            f"{checkpoint} does not tell what its run was begun with: an earlier version wrote it; start a new run with {weights}"
+        )
+    if begun["model"] != options["model"]:
+        raise ValueError(f"{checkpoint} is of a run that trains {begun['model']}; this one trains {options['model']}")
+    for name in {**begun, **options}:
+        if begun.get(name) != options.get(name):
+            raise ValueError(
+                f"{checkpoint} is of a run with {name} {begun.get(name)}, this one has {options.get(name)}; resume it as it was begun, "
+                f"or start a new run with {weights}"
+            )
+
+
+def append(path: Path, values: dict[str, Any]) -> None:
+    """One more line of JSON; what is not finite, which JSON does not know, is null."""
+    finite = {name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in values.items()}
+    with path.open("a") as file:
+        file.write(json.dumps(finite) + "\n")
 
 
 def _replace(folder: Path, fill: Callable[[Path], Any]) -> Path:
@@ -132,5 +220,22 @@ def _flush(path: Path) -> None:
         os.close(descriptor)
 
 
+def _state(checkpoint: Path) -> dict[str, Any]:
+    file = checkpoint / "state.json"
+    try:
+        state = json.loads(file.read_text())
+        return {"step": int(state["step"]), **state}
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{file} is damaged: {error!r}; resume from another checkpoint") from error
+
+
+def _step(checkpoint: Path) -> int:
+    return _state(checkpoint)["step"]
+
+
+def _is_whole(checkpoint: Path) -> bool:
+    return (checkpoint / "state.json").is_file()
+
+
 def _whole(output: Path) -> list[Path]:
-    return sorted(path for path in (output / "checkpoints").glob("step-*") if (path / "state.json").is_file())
+    return sorted(path for path in (output / "checkpoints").glob("step-*") if _is_whole(path))

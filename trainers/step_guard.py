@@ -7,14 +7,12 @@ import math
 from collections import deque
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from accelerate import Accelerator
 from accelerate.utils import gather_object
 from torch import Tensor, nn
-
-from zsdata import StereoBatch
 
 MOST_SKIPPED_IN_A_ROW = 8
 # A hard batch has a few times the loss of the others; gradients are clipped, so only what is far beyond that does harm.
@@ -22,6 +20,15 @@ EXPLOSION = 100.0  # times the median of the recent losses
 RECENT_STEPS = 100
 FEWEST_STEPS = 20  # before there is a median to go by
 IDS = ("epoch", "index", "source", "shard", "key")
+
+
+class Batch(Protocol):
+    """What a step learns from."""
+
+    @property
+    def meta(self) -> list[dict[str, Any]]:
+        """Of each sample, IDS as far as they are known."""
+        ...
 
 
 class TrainingDiverged(RuntimeError):
@@ -34,21 +41,28 @@ class StepGuard:
     A step is refused where the loss of any batch on any rank is not finite or exploded, or where the gradient is not finite (in half
     precision only once the gradient scaler has no scale left to lower). The statistics of batch norms, which the batch has changed
     by then, are set back.
+
+    Args:
+        path: the file that lists the samples of skipped steps.
+        hint: how to look at them.
     """
 
-    def __init__(self, accelerator: Accelerator, matcher: nn.Module, path: Path) -> None:
+    def __init__(
+        self, accelerator: Accelerator, network: nn.Module, path: Path, hint: str = "stream.replay(epoch, index) shows them"
+    ) -> None:
         self.loss = math.nan  # of the last step, mean over batches and ranks
         self.gradient_norm = math.nan
         self.skipped = 0
         self._in_a_row = 0
         self._recent: deque[float] = deque(maxlen=RECENT_STEPS)
-        self._seen: list[tuple[Tensor, StereoBatch]] = []
+        self._seen: list[tuple[Tensor, Batch]] = []
         self._accelerator = accelerator
         self._path = path
-        self._buffers = [buffer for module in matcher.modules() if module.training for buffer in module.buffers(recurse=False)]
+        self._hint = hint
+        self._buffers = [buffer for module in network.modules() if module.training for buffer in module.buffers(recurse=False)]
         self._before = [buffer.clone() for buffer in self._buffers]
 
-    def watch(self, loss: Tensor, batch: StereoBatch) -> None:
+    def watch(self, loss: Tensor, batch: Batch) -> None:
         """One batch of the step."""
         self._seen.append((loss.detach(), batch))
 
@@ -77,7 +91,7 @@ class StepGuard:
         if reason is not None and self._in_a_row >= MOST_SKIPPED_IN_A_ROW:
             raise TrainingDiverged(
                 f"{reason} at step {step}, as something was in each of the last {self._in_a_row} steps, which were skipped; "
-                f"{self._path} lists their samples, stream.replay(epoch, index) shows them, the last ones: {suspects}. "
+                f"{self._path} lists their samples, {self._hint}, the last ones: {suspects}. "
                 "Lower the learning rate, or resume from an earlier checkpoint"
             )
         return reason is not None

@@ -29,11 +29,11 @@ class WeightAverage:
 
 @contextmanager
 def weights_of(average: WeightAverage | None, network: nn.Module) -> Iterator[dict[str, Tensor]]:
-    """The network holds the average meanwhile; gives its own weights, or nothing where there is no average."""
+    """The network holds the average meanwhile; gives its own weights, on the CPU, or nothing where there is no average."""
     if average is None:
         yield {}
         return
-    own = {name: weight.detach().clone() for name, weight in network.state_dict().items()}
+    own = {name: weight.detach().to("cpu", copy=True) for name, weight in network.state_dict().items()}
     try:
         with torch.no_grad():
             for weight, mean in zip(network.parameters(), average.weights, strict=True):

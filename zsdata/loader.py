@@ -268,7 +268,7 @@ class _Pipeline:
         self._pool: WorkerPool | None = None
         if num_workers:
             self._pool = WorkerPool(
-                Job(_start_worker, worker.prepare, stack),
+                Job(start_worker, worker.prepare, stack),
                 requests,
                 processes=num_workers,
                 ahead=PREFETCHED_BATCHES,
@@ -293,7 +293,8 @@ class _Pipeline:
             self._pool.close()
 
 
-def _start_worker() -> None:
+def start_worker() -> None:
+    """What a worker process begins with."""
     warnings.simplefilter("ignore", BuiltinDepthWarning)  # the process that opened the stream has said it
     torch.set_num_threads(1)
     cv2.setNumThreads(1)

@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from accelerate import Accelerator, DistributedType
 from accelerate.state import AcceleratorState
+from huggingface_hub.utils import filter_repo_objects
 from safetensors.torch import load_file
 from skimage.metrics import structural_similarity
 
@@ -26,13 +28,15 @@ from trainers.inpaint_loop import TuneConfig, tune
 from trainers.noise_prediction import NoisePrediction
 from trainers.pairs_on_disk import StereoPair
 from trainers.pipeline_folder import local_pipeline
-from trainers.weight_average import WeightAverage
+from trainers.step_guard import MOST_SKIPPED_IN_A_ROW, TrainingDiverged
+from trainers.weight_average import WeightAverage, weights_of
 from zsdata import AdaptiveDisparity, ZeroStereoStream, load_inpainter
+from zsdata.faults import FaultLog
 from zsdata.source.manifest import build_manifest
 from zsdata.synthesis.inpaint.diffusion_parts import load_diffusion_parts
 
-pytest.importorskip("diffusers")
-pytest.importorskip("transformers")
+diffusers = pytest.importorskip("diffusers")
+transformers = pytest.importorskip("transformers")
 
 ROOT = Path(__file__).resolve().parents[2]
 PUBLISHED = SHARED / "published" / "tiny_inpainting"
@@ -206,6 +210,45 @@ def test_a_resumed_run_equals_the_unbroken_one(pipeline, photos, things, tmp_pat
         assert torch.equal(found[name], weight), name
 
 
+def test_another_run_keeps_its_checkpoints_and_no_photo_is_read(pipeline, photos, tmp_path, monkeypatch):
+    saved = run(pipeline, examples_of(photos=photos), tmp_path, config())
+    before = {path.name for path in saved.parent.parent.iterdir()}
+    with pytest.raises(FileExistsError, match=r"holds the checkpoints of an earlier run, up to step 4: --resume .* another --output"):
+        run(pipeline, examples_of(photos=photos), tmp_path, config(steps=1))
+    assert {path.name for path in saved.parent.parent.iterdir()} == before
+    monkeypatch.setattr(sys, "argv", ["inpaint.py", *map(str, arguments_for(pipeline, tmp_path, "--photos", "nowhere.tar"))])
+    with pytest.raises(SystemExit, match="checkpoints of an earlier run"):
+        run_trainer(inpaint.main)
+
+
+def test_what_is_refused_is_counted_by_reason_over_ranks_and_resumes(pipeline, things, tmp_path, capsys, monkeypatch):
+    broken = shutil.copytree(things, tmp_path / "things")
+    (broken / "frames_cleanpass" / "TRAIN" / "A" / "0000" / "right" / "0002.png").unlink()
+    run(pipeline, examples_of(things=broken), tmp_path / "run", config(steps=4, save_every=2, workers=1))  # each pair comes once in a step
+    assert "refused, and replaced by others: no file: 4" in capsys.readouterr().out
+    (line,) = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert line["step"] == 4 and line["refused"] == {"no file": 4}
+    half = tmp_path / "run" / "checkpoints" / "step-00000002"
+    assert json.loads((half / "state.json").read_text())["refused"] == {"no file": 2}
+    logs = []
+    monkeypatch.setattr(inpaint_loop, "FaultLog", lambda budget, ranks: logs.append(ranks) or FaultLog(budget, ranks))
+    saved = run(pipeline, examples_of(things=broken), tmp_path / "resumed", config(steps=4), resume=half)
+    assert json.loads((saved.parent / "state.json").read_text())["refused"] == {"no file": 4} and logs == [1]
+
+
+def test_faults_in_the_tars_of_photos_are_told(photos, tmp_path, caplog):
+    cut = tmp_path / "cut.tar"
+    cut.write_bytes(Path(photos).read_bytes()[:-20_000])
+    examples_of(photos=cut)
+    assert "1 faults in the tars of photos, the first:" in caplog.text
+
+
+def test_a_matchers_checkpoint_is_not_resumed(pipeline, photos, tmp_path):
+    run_folder.save(tmp_path / "raft", 1, torch.nn.Linear(1, 1), {}, {}, {"options": {"model": "raft_stereo"}})
+    with pytest.raises(ValueError, match=r"step-00000001 is of a run that trains raft_stereo; this one trains an inpainting U-Net"):
+        run(pipeline, examples_of(photos=photos), tmp_path / "run", config(), resume=tmp_path / "raft")
+
+
 def test_a_smaller_micro_batch_and_gradient_checkpointing_change_nothing_but_rounding(pipeline, photos, tmp_path):
     examples = examples_of(photos=photos)
     whole = weights(run(pipeline, examples, tmp_path / "whole", config(steps=2, learning_rate=1e-3)))
@@ -222,12 +265,30 @@ def test_a_run_of_another_seed_data_or_length_is_not_resumed(pipeline, photos, t
         ("state's seed", examples_of(photos=photos, seed=1), config(seed=1)),
         ("state's manifest", examples_of(photos=photos, things=things), config()),
         ("state's configuration", examples_of(photos=photos, batch_size=2), config(batch_size=2, micro_batch=2)),
-        ("planned for 4 steps", examples_of(photos=photos), config(steps=6)),
-        ("has all of the 2 steps", examples_of(photos=photos), config(steps=2)),
+        ("with steps 4, this one has 6; .* --pipeline .*step-00000002/pipeline", examples_of(photos=photos), config(steps=6)),
     ]
     for message, examples, settings in cases:
         with pytest.raises(ValueError, match=message):
             run(pipeline, examples, tmp_path, settings, resume=tmp_path)
+
+
+def test_what_a_run_cannot_change_on_its_way_is_refused_on_resume(pipeline, photos, tmp_path):
+    examples = examples_of(photos=photos)
+    run(pipeline, examples, tmp_path / "run", config(steps=2, ema=0.5, save_every=1))
+    first = tmp_path / "run" / "checkpoints" / "step-00000001"
+    for change, message in {"learning_rate": 1e-3, "ema": 0.9}.items():
+        with pytest.raises(ValueError, match=rf"with {change} .*, this one has {message}"):
+            run(pipeline, examples, tmp_path / "new", config(steps=2, **({"ema": 0.5} | {change: message})), resume=first)
+    with pytest.raises(ValueError, match=r"with ema 0.5, this one has None"):
+        run(pipeline, examples, tmp_path / "new", config(steps=2), resume=first)
+    other = shutil.copytree(pipeline, tmp_path / "other")
+    weights = other / "vae" / "diffusion_pytorch_model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-1] + b"\0")
+    with pytest.raises(ValueError, match=r"with the pipeline's digest \w+, this one has \w+"):
+        run(other, examples, tmp_path / "new", config(steps=2, ema=0.5), resume=first)
+    run(first / "pipeline", examples, tmp_path / "new", config(steps=2, ema=0.5), resume=first)  # the same frozen parts
+    with pytest.raises(ValueError, match="has all of the 2 steps already"):
+        run(pipeline, examples, tmp_path / "run", config(steps=2, ema=0.5), resume=tmp_path / "run")
 
 
 def test_the_average_is_saved_and_the_training_goes_on_with_the_weights_themselves(pipeline, photos, tmp_path):
@@ -247,10 +308,23 @@ def test_the_average_is_saved_and_the_training_goes_on_with_the_weights_themselv
     assert torch.allclose(average.weights[0], begin + 1 - 0.9 * 2 / 11)
 
 
-def test_real_pairs_are_judged_before_and_at_every_checkpoint(pipeline, photos, tmp_path, capsys):
+def test_the_weights_wait_on_the_cpu_while_the_average_stands_in_for_them():
+    """The meta device stands for a GPU here: a copy on it is made without a word, one to the CPU cannot be."""
+    network = torch.nn.Linear(3, 2, device="meta")
+    with pytest.raises(NotImplementedError, match="Cannot copy out of meta tensor"):
+        with weights_of(WeightAverage(network, 0.9), network):
+            pass
+
+
+def test_real_pairs_are_judged_before_and_at_every_checkpoint(pipeline, photos, tmp_path, capsys, monkeypatch):
     pairs = [real_pair(0), real_pair(1)]
     sparse = real_pair(2)._replace(name="sparse", valid=np.arange(96) % 2 == np.zeros((72, 1)))
+    sizes = []
+    monkeypatch.setattr(
+        inpaint_loop, "load_inpainter", lambda *a, **options: sizes.append(options["micro_batch"]) or load_inpainter(*a, **options)
+    )
     run(pipeline, examples_of(photos=photos), tmp_path, config(steps=4), pairs=[*pairs, sparse])
+    assert sizes == [1, 1, 1]  # no memory is measured for more: cases are judged one by one
     rows = [json.loads(line) for line in (tmp_path / "validation.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == [0, 2, 4]
     for row in rows:
@@ -325,10 +399,56 @@ def test_a_rank_with_other_photos_is_named_before_the_first_step(pipeline, photo
         run(pipeline, examples_of(photos=photos), tmp_path / "run", config())
 
 
-def test_a_loss_that_is_not_finite_names_the_examples(pipeline, photos, tmp_path, monkeypatch):
-    monkeypatch.setattr(NoisePrediction, "loss", lambda self, model, batch: torch.tensor(float("nan"), requires_grad=True))
-    with pytest.raises(RuntimeError, match=r"the loss is nan at step 0; examples: 00000\d in .*photos.tar"):
-        run(pipeline, examples_of(photos=photos), tmp_path, config())
+def test_a_step_whose_loss_is_not_finite_changes_nothing_and_its_examples_are_written_down(pipeline, photos, tmp_path, monkeypatch):
+    asked = NoisePrediction.loss
+
+    def nan_in_step_two(self, model, batch):
+        return asked(self, model, batch) * (float("nan") if batch.requests[-1][0] == 2 else 1)
+
+    monkeypatch.setattr(NoisePrediction, "loss", nan_in_step_two)
+    examples, settings = examples_of(photos=photos), config(steps=4, save_every=1, ema=0.5, micro_batch=2)
+    saved = run(pipeline, examples, tmp_path / "run", settings)
+    own = [run_folder.load(saved.parent.with_name(f"step-0000000{step}"))[0]["weights"] for step in (2, 3, 4)]
+    assert all(torch.equal(own[0][name], weight) for name, weight in own[1].items())
+    assert any(not torch.equal(own[1][name], weight) for name, weight in own[2].items())
+    lines = [json.loads(line) for line in (tmp_path / "run" / "skipped.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [2, 2] and all(line["reason"].startswith("the loss is nan") for line in lines)
+    listed = [(sample["epoch"], sample["index"]) for line in lines for sample in line["samples"]]
+    assert listed == [examples.place(2, index) for index in range(4)] and lines[0]["samples"][0]["shard"] == str(photos)
+    resumed = run(pipeline, examples, tmp_path / "again", settings, resume=saved.parent.with_name("step-00000003"))
+    assert json.loads((tmp_path / "again" / "log.jsonl").read_text())["skipped_steps"] == 1
+    assert all(torch.equal(weights(resumed)[name], weight) for name, weight in weights(saved).items())
+
+
+def test_a_loss_that_stays_not_finite_is_an_error(pipeline, photos, tmp_path, monkeypatch):
+    monkeypatch.setattr(NoisePrediction, "loss", lambda self, model, batch: model.conv_in.weight.sum() * float("nan"))
+    with pytest.raises(
+        TrainingDiverged, match=rf"the loss is nan at step {MOST_SKIPPED_IN_A_ROW - 1}, .*skipped.jsonl lists .*Lower the learning"
+    ):
+        run(pipeline, examples_of(photos=photos), tmp_path, config(steps=20))
+
+
+def test_a_tracker_that_is_not_installed_is_an_error_and_so_is_a_network_in_shards(pipeline, photos, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch, pytest.raises(ImportError, match="tracker wandb is not installed: pip install wandb"):
+        patch.setattr("accelerate.tracking.get_available_trackers", lambda: [])
+        run(pipeline, examples_of(photos=photos), tmp_path, config(steps=1), tracker="wandb")
+    monkeypatch.setattr(Accelerator, "distributed_type", property(lambda accelerator: DistributedType.DEEPSPEED))
+    with pytest.raises(ValueError, match="was told to use DEEPSPEED; these trainers keep the whole network"):
+        run(pipeline, examples_of(photos=photos), tmp_path, config(steps=1))
+
+
+@pytest.mark.filterwarnings("ignore:The built-in depth")
+def test_a_device_that_is_too_small_is_one_line_that_says_what_to_lower(pipeline, photos, tmp_path, monkeypatch):
+    def full(self, model, batch):
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.\nmore lines")
+
+    monkeypatch.setattr(NoisePrediction, "loss", full)
+    data = ["--photos", photos, "--depth", "builtin", "--tracker", "none"]
+    monkeypatch.setattr(sys, "argv", ["inpaint.py", *map(str, arguments_for(pipeline, tmp_path / "run", *data))])
+    with pytest.raises(
+        SystemExit, match=r"^inpaint.py: .* lower --micro-batch, add --gradient-checkpointing .*--size\. CUDA out of .* GiB\.$"
+    ):
+        run_trainer(inpaint.main)
 
 
 @pytest.mark.parametrize(
@@ -337,6 +457,7 @@ def test_a_loss_that_is_not_finite_names_the_examples(pipeline, photos, tmp_path
         ({"steps": 0}, "steps is 1 or more; got 0"),
         ({"learning_rate": 0.0}, "learning_rate is above 0"),
         ({"workers": -1}, "workers is 0 or more"),
+        ({"seed": -1}, "seed is 0 or more; got -1"),
         ({"ema": 1.0}, r"decay in \(0, 1\)"),
     ],
 )
@@ -349,8 +470,9 @@ def test_the_batch_must_split_into_micro_batches(pipeline, photos, tmp_path):
     assert config(batch_size=32, micro_batch=4).accumulate(2) == 4
     with pytest.raises(ValueError, match="batch_size 4 is no multiple of micro_batch 3 times 1 ranks"):
         run(pipeline, examples_of(photos=photos), tmp_path, config(micro_batch=3))
-    with pytest.raises(ValueError, match=r"multiples of 8 px .* got \(60, 64\)"):
-        run(pipeline, examples_of(photos=photos, size=(60, 64)), tmp_path, config())
+    for size in ((60, 64), (0, 0), (-8, -8)):
+        with pytest.raises(ValueError, match=rf"multiples of 8 px .*, 8 or more; got {re.escape(str(size))}"):
+            run(pipeline, examples_of(photos=photos, size=size), tmp_path, config())
 
 
 def test_a_pipeline_is_found_in_the_hubs_cache_without_network(pipeline, tmp_path):
@@ -361,13 +483,80 @@ def test_a_pipeline_is_found_in_the_hubs_cache_without_network(pipeline, tmp_pat
     program = (
         "from trainers.pipeline_folder import local_pipeline\n"
         'folder = local_pipeline("somebody/pipelines", "StereoGen")\n'
-        'assert (folder / "unet" / "config.json").is_file(), folder\n'
+        'assert (folder / "StereoGen" / "unet" / "config.json").is_file(), folder\n'
     )
     offline = {**os.environ, "HF_HOME": str(tmp_path), "HF_HUB_CACHE": str(tmp_path / "hub"), "HF_HUB_OFFLINE": "1"}
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, env=offline, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     with pytest.raises(FileNotFoundError, match="neither a folder nor a Hub id"):
         local_pipeline("no/such/folder")
+    with pytest.raises(FileNotFoundError, match=r'no folder "StereoJen" in'):
+        local_pipeline(str(repository), "StereoJen")
+
+
+def test_what_is_downloaded_is_what_is_needed(monkeypatch, tmp_path):
+    """The card and the licence of the repository's root too, but no safety checker of a gigabyte, nor a piece of it."""
+    files = ["README.md", "LICENSE.txt", "model_index.json", "unet/config.json", "img/teaser.json"]
+    inner = ["README.md", "model_index.json", "feature_extractor/preprocessor_config.json", "safety_checker/config.json"]
+    inner += ["safety_checker/model.safetensors", "image_encoder/config.json"]
+    for part in ("unet", "vae", "text_encoder"):
+        inner += [f"{part}/config.json", f"{part}/model.safetensors", f"{part}/model.fp16.safetensors", f"{part}/model.bin"]
+    asked = {}
+
+    def snapshot_download(name, revision, allow_patterns, ignore_patterns):
+        every = [*files, *(f"StereoGen/{file}" for file in inner)]
+        asked["files"] = list(filter_repo_objects(every, allow_patterns=allow_patterns, ignore_patterns=ignore_patterns))
+        return tmp_path
+
+    monkeypatch.setattr("huggingface_hub.snapshot_download", snapshot_download)
+    local_pipeline("somebody/pipelines", "StereoGen")
+    weighted = [f"StereoGen/{part}/{file}" for part in ("unet", "vae", "text_encoder") for file in ("config.json", "model.safetensors")]
+    about = ["StereoGen/README.md", "StereoGen/model_index.json", "StereoGen/feature_extractor/preprocessor_config.json"]
+    assert sorted(asked["files"]) == sorted(["README.md", "LICENSE.txt", *about, *weighted])
+
+
+@pytest.mark.parametrize("safety_checker", ["whole", "without weights"])
+def test_diffusers_itself_loads_what_is_written(pipeline, photos, tmp_path, safety_checker):
+    """Whatever parts the index names: those that are there come along, the others are given up."""
+    from diffusers.pipelines.stable_diffusion.safety_checker import StableDiffusionSafetyChecker
+
+    source = shutil.copytree(pipeline, tmp_path / "source")
+    unet = source / "unet" / "config.json"
+    unet.write_text(json.dumps(json.loads(unet.read_text()) | {"sample_size": 64}))
+    extractor, checker = source / "feature_extractor", source / "safety_checker"
+    transformers.CLIPImageProcessor().save_pretrained(extractor)
+    vision = {"hidden_size": 8, "intermediate_size": 8, "num_hidden_layers": 1, "num_attention_heads": 1}
+    settings = transformers.CLIPConfig(projection_dim=8, vision_config=vision, text_config=vision | {"vocab_size": 4})
+    StableDiffusionSafetyChecker(settings).save_pretrained(checker)
+    if safety_checker == "without weights":
+        (checker / "model.safetensors").rename(checker / "pytorch_model.bin")
+    parts = {
+        "feature_extractor": ["transformers", "CLIPImageProcessor"],
+        "safety_checker": ["stable_diffusion", "StableDiffusionSafetyChecker"],
+        "image_encoder": [None, None],
+        "scheduler": ["diffusers", "PNDMScheduler"],
+        "text_encoder": ["transformers", "CLIPTextModel"],
+        "tokenizer": ["transformers", "CLIPTokenizer"],
+        "unet": ["diffusers", "UNet2DConditionModel"],
+        "vae": ["diffusers", "AutoencoderKL"],
+    }
+    index = {"_class_name": "StableDiffusionInpaintPipeline", "_diffusers_version": "0.8.0", "requires_safety_checker": False, **parts}
+    (source / "model_index.json").write_text(json.dumps(index))
+    saved = run(source, examples_of(photos=photos), tmp_path / "run", config(steps=1))
+    loaded = diffusers.DiffusionPipeline.from_pretrained(saved)
+    assert loaded.feature_extractor is not None and (loaded.safety_checker is not None) == (safety_checker == "whole")
+    assert json.loads((saved / "model_index.json").read_text())["image_encoder"] == [None, None]
+
+
+def test_the_licence_of_a_repository_goes_with_what_was_tuned_from_a_part_of_it(pipeline, photos, tmp_path):
+    shutil.copytree(pipeline, tmp_path / "source" / "StereoGen")
+    (tmp_path / "source" / "README.md").write_text("---\nlicense: mit\n---\n")
+    (tmp_path / "source" / "LICENSE").write_text("MIT")
+    saved = run(tmp_path / "source", examples_of(photos=photos), tmp_path / "own", config(steps=1), subfolder="StereoGen")
+    assert "openrail" in (saved / "README.md").read_text() and (saved / "LICENSE").read_text() == "MIT"
+    (tmp_path / "source" / "StereoGen" / "README.md").unlink()
+    saved = run(tmp_path / "source", examples_of(photos=photos), tmp_path / "roots", config(steps=1), subfolder="StereoGen")
+    assert "license: mit" in (saved / "README.md").read_text()
 
 
 def arguments_for(pipeline, output, *more):
@@ -410,8 +599,10 @@ def test_the_command_tunes_on_two_ranks_as_on_one(pipeline, photos, things, tmp_
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        (["--output", "README.md"], "--output README.md is a file; name a folder"),
         ([], "nothing to learn from: name --photos or --datasets"),
         (["--photos", "nowhere.tar"], "nowhere.tar"),
+        (["--depth-cache", "depth"], "--depth-cache keeps the depth of photos; name --photos, or leave it out"),
         (["--datasets", "kitti=somewhere"], "takes KIND=FOLDER with one of sceneflow-clean"),
         (["--datasets", "tartanair=nowhere"], "no folder nowhere"),
         (["--datasets", "vkitti2=tests", "--pipeline", "nowhere"], "no pair of vkitti2 in tests"),

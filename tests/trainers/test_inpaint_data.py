@@ -138,6 +138,20 @@ def test_a_pair_is_read_as_it_is_published(tmp_path, kind):
     assert pairs.place(0) == (str(tmp_path), next(iter(files)))
 
 
+@pytest.mark.parametrize("root", ["", "vkitti_2.0.3_rgb"])
+def test_virtual_kitti_is_read_as_its_tars_unpack_too(tmp_path, root):
+    files, disparity = PUBLISHED["vkitti2"]
+    files = files | {"Scene01/15-deg-left/frames/depth/Camera_1/depth_00000.png": png(DEPTH_CM)}
+    write(tmp_path, {f"vkitti_2.0.3_{'depth' if '/depth/' in name else 'rgb'}/{name}": data for name, data in files.items()})
+    pairs = StereoFolder("vkitti2", tmp_path / root)
+    frame = pairs.read(0)
+    assert len(pairs) == 1 and frame.right_disparity is not None
+    assert np.allclose(frame.disparity, disparity, rtol=1e-6)
+    (tmp_path / "vkitti_2.0.3_depth" / "Scene01/15-deg-left/frames/depth/Camera_0/depth_00000.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"no file .*vkitti_2.0.3_depth/Scene01.*depth_00000.png, which belongs to .*rgb_00000.jpg"):
+        StereoFolder("vkitti2", tmp_path / root)
+
+
 def test_disparity_of_the_right_view_is_positive_too(tmp_path):
     frame = StereoFolder("sceneflow-clean", write(tmp_path, PUBLISHED["sceneflow-clean"][0])).read(0)
     assert frame.right_disparity is not None and np.allclose(frame.right_disparity, RIGHT_DISPARITY, rtol=1e-6)
@@ -153,6 +167,14 @@ def test_all_of_scene_flow_is_found_from_one_folder_also_as_webp_and_through_lin
     pairs = StereoFolder("sceneflow-clean", tmp_path / "all")
     assert [pairs.place(i)[1].split("/")[0] for i in range(len(pairs))] == ["Driving", "FlyingThings3D", "Monkaa"]
     assert all(np.abs(pairs.read(i).left.astype(int) - LEFT).max() <= 1 for i in range(3))
+
+
+def test_links_that_go_round_or_lead_to_one_folder_count_each_pair_once(tmp_path):
+    root = write(tmp_path / "all", PUBLISHED["sceneflow-clean"][0])
+    for name, target in {"again": "FlyingThings3D", "current": ".", "latest": ".", "FlyingThings3D/up": ".."}.items():
+        os.symlink(target, root / name)  # "again" comes before the folder itself
+    pairs = StereoFolder("sceneflow-clean", root)
+    assert [pairs.place(i)[1] for i in range(len(pairs))] == ["FlyingThings3D/frames_cleanpass/TRAIN/A/0000/left/0006.png"]
 
 
 @pytest.mark.skipif(not THINGS.is_dir(), reason="the real pair is not here")

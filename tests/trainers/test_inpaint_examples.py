@@ -1,16 +1,21 @@
 import io
+import os
+import signal
 from functools import partial
 
 import numpy as np
+import psutil
 import pytest
 import torch
 
 from tests.scenes import jpeg, layered_depth, photo, photo_tar, write_tar
+from trainers.inpaint_data.batches import making, requests
 from trainers.inpaint_data.examples import SYMMETRIC_COLOUR, from_photo, from_stereo, hidden_from_left
-from trainers.inpaint_data.sources import ExampleBatch, Examples, PhotoSource, StereoSource, requests
+from trainers.inpaint_data.sources import ExampleBatch, Examples, PhotoSource, StereoSource
 from trainers.inpaint_data.stored_maps import StereoFrame
+from zsdata import ZeroStereoStream
 from zsdata.augment import AugmentConfig
-from zsdata.faults import BadPhoto, NoUsablePhoto
+from zsdata.faults import BadPhoto, NoUsablePhoto, WorkerLost
 from zsdata.seeding import rng
 from zsdata.source.manifest import build_manifest
 from zsdata.source.photo import decode_rgb
@@ -227,14 +232,14 @@ def test_an_example_is_a_function_of_seed_step_and_index(tmp_path):
     for request in ((0, 0), (3, 1), (70, 2)):
         first, again = one[request], other[request]
         assert all(torch.equal(getattr(first, name), getattr(again, name)) for name in ("right", "warped", "inpaint_mask"))
-        assert first.requests == [request] and first.places == again.places and first.right.dtype == torch.uint8
+        assert first.requests == [request] and first.meta == again.meta and first.right.dtype == torch.uint8
     assert not torch.equal(one[0, 0].right, make(seed=1)[0, 0].right)
     # every pair and photo once an epoch, whatever the batch size
     for batch_size in (2, 4):
         examples = make(batch_size=batch_size)
         for epoch in range(2):
             numbers = range(8 * epoch, 8 * epoch + 8)
-            assert len({examples[divmod(number, batch_size)].places[0] for number in numbers}) == 8
+            assert len({examples[divmod(number, batch_size)].meta[0]["key"] for number in numbers}) == 8
 
 
 def test_a_broken_pair_is_replaced_and_told(tmp_path):
@@ -242,7 +247,7 @@ def test_a_broken_pair_is_replaced_and_told(tmp_path):
     made = [examples[divmod(number, 4)] for number in range(30)]
     rejected = [example.rejected for example in made if example.rejected]
     assert 5 < len(rejected) <= 15 and all(entry == [("pairs", "somewhere", "pair 1", "damaged map: nothing")] for entry in rejected)
-    assert {place for example in made for place in example.places} == {"pair 0 in somewhere", "pair 2 in somewhere"}
+    assert {meta["key"] for example in made for meta in example.meta} == {"pair 0", "pair 2"}
     with pytest.raises(NoUsablePhoto, match="nothing usable for example 0 of step 0: 3 of pairs were refused"):
         Examples({"pairs": StereoSource(Pairs(broken=(0, 1, 2)))}, (32, 48), 0, 4)[0, 0]
 
@@ -276,6 +281,33 @@ def test_depth_stored_beside_the_photos_gives_the_examples_of_the_estimator_that
     }
     with pytest.raises(ValueError, match="not one of the 3 photos"):
         made("stored", photos)
+
+
+def test_depth_is_estimated_once_and_a_stream_may_have_done_it(tmp_path):
+    tar, calls = photo_tar(tmp_path / "photos.tar", 3, height=64, width=96), []
+
+    def estimator(images):
+        calls.append(len(images))
+        return layered_depth(images)
+
+    estimator.cache_name = "layered"
+
+    def made(cache=None, depth=estimator):
+        examples = Examples({"photos": PhotoSource(build_manifest(tar), depth, AdaptiveDisparity(), cache)}, (32, 48), 0, 3)
+        return [examples[step, number] for step in range(2) for number in range(3)]
+
+    without, first, estimated = made(), made(tmp_path / "cache"), len(calls)
+    again = made(tmp_path / "cache")
+    assert estimated == 6 + 2 * 3 and len(calls) == estimated  # once per epoch without; once with, and mirrored
+    for one, other, third in zip(without, first, again, strict=True):
+        assert torch.equal(one.inpaint_mask, other.inpaint_mask) and torch.equal(other.right, third.right)
+    for pair in ZeroStereoStream(tar, size=(32, 48), depth=estimator, depth_cache=tmp_path / "of a stream"):
+        assert pair is not None
+    estimated = len(calls)
+    made(tmp_path / "of a stream")
+    assert len(calls) == estimated
+    with pytest.raises(ValueError, match="a depth cache would keep it a second time"):
+        made(tmp_path / "cache", "stored")
 
 
 def test_a_depth_network_that_is_nowhere_is_named_at_once(tmp_path):
@@ -315,9 +347,38 @@ def test_the_position_tells_other_data_and_other_options_apart(tmp_path):
 def test_batches_stack_in_order():
     parts = [
         ExampleBatch(
-            torch.full((1, 3, 2, 2), i, dtype=torch.uint8), torch.zeros(1, 3, 2, 2), torch.zeros(1, 1, 2, 2) > 0, [(0, i)], [str(i)], []
+            torch.full((1, 3, 2, 2), i, dtype=torch.uint8), torch.zeros(1, 3, 2, 2), torch.zeros(1, 1, 2, 2) > 0, [(0, i)], [{"key": i}], []
         )
         for i in range(3)
     ]
     batch = ExampleBatch.stack(parts)
-    assert batch.right[:, 0, 0, 0].tolist() == [0, 1, 2] and batch.requests == [(0, 0), (0, 1), (0, 2)] and batch.places == ["0", "1", "2"]
+    assert batch.right[:, 0, 0, 0].tolist() == [0, 1, 2] and batch.requests == [(0, 0), (0, 1), (0, 2)]
+    assert [meta["key"] for meta in batch.meta] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_batches_are_the_same_whoever_makes_them_and_come_in_the_order_of_their_steps(workers):
+    examples = Examples({"pairs": StereoSource(Pairs())}, (32, 48), 0, 4)
+    with making(examples, requests(1, 4, 4, 2, 0, 1), workers, torch.device("cpu")) as batches:
+        made = list(batches)
+    assert [batch.requests for batch in made] == [[(step, index), (step, index + 1)] for step in (1, 2, 3) for index in (0, 2)]
+    for batch in made:
+        assert torch.equal(batch.right, torch.cat([examples[request].right for request in batch.requests]))
+    assert [(meta["epoch"], meta["index"]) for meta in made[0].meta] == [(1, 1), (1, 2)]  # the fifth example and the sixth
+
+
+def test_what_goes_wrong_in_a_worker_arrives_as_itself_and_in_one_line():
+    nothing = Examples({"pairs": StereoSource(Pairs(broken=(0, 1, 2)))}, (32, 48), 0, 4)
+    with making(nothing, requests(0, 4, 4, 2, 0, 1), 1, torch.device("cpu")) as batches:
+        with pytest.raises(NoUsablePhoto, match=r"^nothing usable for example 0 of step 0: 3 of pairs were refused, .*$"):
+            next(batches)
+
+    class Killing(Pairs):
+        def read(self, index):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    killing = Examples({"pairs": StereoSource(Killing())}, (32, 48), 0, 4)
+    with making(killing, requests(2, 4, 4, 2, 0, 1), 1, torch.device("cpu")) as batches:
+        with pytest.raises(WorkerLost, match=r"worker 0 of 1 .* was killed by SIGKILL; it was at sample 2 of epoch 2.*memory runs out"):
+            next(batches)
+    assert not psutil.Process().children()

@@ -1,4 +1,4 @@
-"""Checkpoints: killed at any step of writing one, a run goes on from the last whole one."""
+"""Checkpoints belong to one run; killed at any step of writing one, a run goes on from the last whole one."""
 
 from __future__ import annotations
 
@@ -103,3 +103,51 @@ def test_killed_at_any_touch_of_a_file_there_is_a_whole_checkpoint_and_the_next_
         if not killed:
             break
     assert touch > 10 and len(outcomes) <= 3
+
+
+def test_a_new_run_is_refused_in_the_folder_of_another_and_told_the_way_out(tmp_path):
+    run_folder.check_output(tmp_path / "new", None)
+    for step in (100, 200):
+        save(tmp_path / "old", step, 1.0)
+    with pytest.raises(FileExistsError, match=rf"{tmp_path}/old holds .* up to step 200: --resume {tmp_path}/old .* another --output"):
+        run_folder.check_output(tmp_path / "old", None)
+    shutil.move(tmp_path / "old" / "checkpoints" / "step-00000100", tmp_path / "best" / "best")
+    with pytest.raises(FileExistsError, match="up to step 100"):
+        run_folder.check_output(tmp_path / "best", None)
+    (tmp_path / "file").touch()
+    with pytest.raises(NotADirectoryError, match=r"--output .*file is a file"):
+        run_folder.check_output(tmp_path / "file", None)
+
+
+def test_a_run_goes_on_in_its_own_folder_from_its_last_checkpoint_or_in_a_new_one_from_any(tmp_path):
+    for run in ("run", "other"):
+        for step in (100, 200):
+            save(tmp_path / run, step, 1.0)
+    run = tmp_path / "run"
+    first, last = (run / "checkpoints" / f"step-{step:08d}" for step in (100, 200))
+    for start in (run, last):
+        run_folder.check_output(run, start)
+    for start in (run, first, last):
+        run_folder.check_output(tmp_path / "new", start)
+    with pytest.raises(FileExistsError, match=rf"later checkpoint than {first}: {last}, of step 200. .*another --output, or move"):
+        run_folder.check_output(run, first)
+    with pytest.raises(FileExistsError, match=rf"{tmp_path}/other holds the checkpoints of another run than {last}"):
+        run_folder.check_output(tmp_path / "other", run)
+    with pytest.raises(FileNotFoundError, match="no checkpoint to resume from"):
+        run_folder.check_output(tmp_path / "new", tmp_path / "nowhere")
+
+
+def test_the_checkpoint_that_was_just_written_is_never_the_one_that_is_removed(tmp_path):
+    for step in (100, 200, 300, 400, 50):
+        written = save(tmp_path, step, float(step))
+        assert value_of(written) == step and written == run_folder.folder_of(tmp_path, step)
+    assert len(list((tmp_path / "checkpoints").iterdir())) == run_folder.KEPT_CHECKPOINTS
+
+
+@pytest.mark.parametrize("file", ["training.pt", "state.json"])
+@pytest.mark.parametrize("content", [b"", b"{", b"PK\x03\x04 cut off"])
+def test_a_damaged_checkpoint_is_named_file_and_all(tmp_path, file, content):
+    folder = save(tmp_path, 1, 1.0)
+    (folder / file).write_bytes(content)
+    with pytest.raises(ValueError, match=rf"{folder}/{file} is damaged.*resume from another checkpoint"):
+        run_folder.load(folder)

@@ -11,6 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 import torch
+from accelerate import Accelerator, DistributedType
 from accelerate.state import AcceleratorState
 from accelerate.tracking import GeneralTracker
 from safetensors.torch import load_file
@@ -217,11 +218,39 @@ def test_the_best_of_another_folder_or_of_the_checkpoint_itself_is_restored(tar,
     assert not list((tmp_path / "elsewhere").glob(".*"))
 
 
-def test_another_number_of_steps_is_refused_on_resume(tar, tmp_path):
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (["--steps", "4"], r"with steps 2, this one has 4; .*--initial-weights .*model.safetensors"),
+        (["--learning-rate", "0.1"], "with learning_rate 0.0002, this one has 0.1"),
+        (["--ema", "0.9"], "with ema None, this one has 0.9"),
+        (["--corr-radius", "3"], "with corr_radius 4, this one has 3"),
+        (["--corr-implementation", "alt"], None),
+    ],
+)
+def test_what_a_run_cannot_change_on_its_way_is_refused_on_resume(tar, tmp_path, monkeypatch, change, message):
+    run_command(monkeypatch, *arguments_for(tar, tmp_path / "run", "--steps", 2, "--save-every", 1))
+    changed = arguments_for(tar, tmp_path / "new", "--steps", 2, *change, "--resume", tmp_path / "run" / "checkpoints" / "step-00000001")
+    if message is None:
+        run_command(monkeypatch, *changed)
+    else:
+        with pytest.raises(SystemExit, match=message):
+            run_command(monkeypatch, *changed)
+
+
+def test_a_run_of_another_matcher_is_not_resumed(tar, tmp_path, monkeypatch):
     run_training(tar, tmp_path / "run", config(steps=2))
-    AcceleratorState._reset_state(reset_partial_state=True)
-    with pytest.raises(ValueError, match=r"of a run of 2 steps.*--steps 2.*--initial-weights"):
-        run_training(tar, tmp_path / "run", config(steps=4), resume=tmp_path / "run")
+    with pytest.raises(SystemExit, match="is of a run that trains raft_stereo; this one trains igev_stereo"):
+        run_command(monkeypatch, *arguments_for(tar, tmp_path / "new", "--resume", tmp_path / "run", small=[]), trainer=igev)
+
+
+def test_another_run_keeps_its_checkpoints_and_no_photo_is_read(tar, tmp_path, monkeypatch):
+    run_training(tar, tmp_path / "run", config(steps=2))
+    with pytest.raises(FileExistsError, match=r"holds the checkpoints of an earlier run, up to step 2: --resume .* another --output"):
+        run_training(tar, tmp_path / "run", config(steps=1))
+    assert run_folder.newest(tmp_path / "run").name == "step-00000002"
+    with pytest.raises(SystemExit, match=r"^raft.py: .*checkpoints of an earlier run"):
+        run_command(monkeypatch, *arguments_for("nowhere.tar", tmp_path / "run"))
 
 
 def test_a_run_folder_holds_what_evaluation_and_resume_need(tar, tmp_path):
@@ -276,6 +305,14 @@ def test_too_many_skipped_steps_in_a_row_are_an_error_and_the_run_can_be_resumed
     assert all(torch.isfinite(weight).all() for weight in matcher.state_dict().values())
 
 
+def test_a_device_that_is_too_small_is_an_error_that_says_what_to_lower(tar, tmp_path):
+    def full(initial, sequence, batch):
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+
+    with pytest.raises(MemoryError, match=r"lower --batch-size .* CUDA out of memory"):
+        run_training(tar, tmp_path / "run", config(steps=1), loss=full)
+
+
 def test_mixed_precision_trains_and_judges_as_evaluate_does(tar, tmp_path, pairs_folder):
     sets = [EvaluationSet.parse(str(pairs_folder))]
     settings = config(steps=2, mixed_precision="bf16", channels_last=True, evaluation_iterations=3)
@@ -328,6 +365,12 @@ def test_a_tracker_that_is_not_installed_is_an_error(tar, tmp_path, monkeypatch)
     monkeypatch.setattr("accelerate.tracking.get_available_trackers", lambda: [])
     with pytest.raises(ImportError, match="tracker wandb is not installed: pip install wandb"):
         run_training(tar, tmp_path / "run", config(steps=1), tracker="wandb")
+
+
+def test_a_network_in_shards_is_refused(tar, tmp_path, monkeypatch):
+    monkeypatch.setattr(Accelerator, "distributed_type", property(lambda accelerator: DistributedType.FSDP))
+    with pytest.raises(ValueError, match=r"was told to use FSDP; .* launch with --multi_gpu"):
+        run_training(tar, tmp_path / "run", config(steps=1))
 
 
 ACCELERATE = [Path(sys.executable).with_name("accelerate"), "launch", "--cpu", "--num_machines", "1", "--mixed_precision", "no"]

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import re
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ TARTANAIR_FOCAL_PX, TARTANAIR_BASELINE_M = 320.0, 0.25
 CRESTEREO_DIVISOR = 32
 # Virtual KITTI 2 (README of the data set): 16-bit PNG of depth in centimetres, the sky at 655.35 m.
 VKITTI2_FOCAL_PX, VKITTI2_BASELINE_M, VKITTI2_CENTIMETRES = 725.0087, 0.532725, 100
+VKITTI2_APART = ("vkitti_2.0.3_rgb/", "vkitti_2.0.3_depth/")  # the names of its tars
 # Falling Things (README of the data set): 16-bit PNG of depth in tenths of a millimetre; the focal length lies beside the images.
 FALLING_THINGS_FOCAL_PX, FALLING_THINGS_BASELINE_M, FALLING_THINGS_UNITS = 768.16058349609375, 0.06, 10_000
 FALLING_THINGS_CAMERA = "_camera_settings.json"
@@ -36,6 +38,7 @@ class Layout:
     truth: str  # disparity or depth of the left view
     right_truth: str  # of the right view; the pair does without where there is no such file
     disparity: Callable[[np.ndarray, Path], np.ndarray]  # (stored values, the folder they lie in) -> pixels
+    apart: tuple[str, str] | None = None  # folders that images and truth are unpacked into, side by side, where not together
     example: str  # a left image below the root, for people
 
 
@@ -102,7 +105,8 @@ LAYOUTS = {
         truth=r"\g<1>frames/depth/Camera_0/depth_\g<2>.png",
         right_truth=r"\g<1>frames/depth/Camera_1/depth_\g<2>.png",
         disparity=_vkitti2,
-        example="Scene01/clone/frames/rgb/Camera_0/rgb_00000.jpg",
+        apart=VKITTI2_APART,
+        example=f"Scene01/clone/frames/rgb/Camera_0/rgb_00000.jpg, or {VKITTI2_APART[0]}Scene01/...",
     ),
     "fallingthings": Layout(
         left=re.compile(r"(.+)\.left\.jpg"),
@@ -167,8 +171,10 @@ class StereoFolder:
     def _paths(self, index: int) -> tuple[Path, Path, Path, Path]:
         """Left image, right image, truth of the left view, truth of the right view."""
         layout, path = self._layout, self._lefts[index]
-        right, truth, right_truth = (layout.left.sub(part, path) for part in (layout.right, layout.truth, layout.right_truth))
-        return self._root / path, self._root / right, self._root / truth, self._root / right_truth
+        right, truth, right_truth = (self._root / layout.left.sub(part, path) for part in (layout.right, layout.truth, layout.right_truth))
+        if layout.apart is not None and not truth.is_file():  # the root may be the images' folder itself
+            truth, right_truth = (Path(one.as_posix().replace(*layout.apart)) for one in (truth, right_truth))
+        return self._root / path, right, truth, right_truth
 
     def _disparity(self, path: Path) -> np.ndarray:
         stored = decode_map(_content(path), path.suffix[1:])
@@ -177,11 +183,20 @@ class StereoFolder:
 
 
 def _files_below(root: Path) -> list[str]:
-    """Paths relative to `root`; links to folders are followed, as data sets are often linked together."""
-    found = []
-    for folder, _, names in os.walk(root, followlinks=True):
-        inner = Path(folder).relative_to(root).as_posix()
-        found += names if inner == "." else [f"{inner}/{name}" for name in names]
+    """Paths relative to `root`. Links to folders are followed, as data sets are often linked together; but no folder is visited twice, and
+    one that has a place of its own counts there."""
+    found, visited, starts = list[str](), set[tuple[int, int]](), deque([root])
+    while starts:
+        for folder, below, names in os.walk(starts.popleft()):  # follows no link itself
+            known = os.stat(folder)
+            if (known.st_dev, known.st_ino) in visited:
+                below.clear()
+                continue
+            visited.add((known.st_dev, known.st_ino))
+            inner = Path(folder).relative_to(root)
+            found += [(inner / name).as_posix() for name in names]
+            below.sort()
+            starts += [path for path in (Path(folder, name) for name in below) if path.is_symlink()]
     return found
 
 

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+import logging
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset
 
 from trainers.inpaint_data.examples import Draw, Example, from_photo, from_stereo
 from trainers.inpaint_data.layouts import StereoFolder
 from trainers.inpaint_data.tars import StereoTars
 from zsdata.faults import BadPhoto, BadShard, NoUsablePhoto
+from zsdata.meter import Meter
 from zsdata.plan import Choice, EpochPlan
 from zsdata.position import Position
 from zsdata.seeding import rng
@@ -24,13 +27,18 @@ from zsdata.source.depth_map import decode_depth
 from zsdata.source.manifest import Manifest
 from zsdata.source.photo import PhotoFile
 from zsdata.sources import check_depth_maps
-from zsdata.synthesis.confidence import normalize_inverse_depth
+from zsdata.stream import DEPTH_CACHE_BYTES
 from zsdata.synthesis.depth import DepthEstimator, as_network, load_depth
 from zsdata.synthesis.depth.builtin import warn_once
+from zsdata.synthesis.depth.cache import DepthCache, photo_digest
+from zsdata.synthesis.depth.identity import depth_identity
 from zsdata.synthesis.depth.options import STORED
 from zsdata.synthesis.depth.pretrained import load_preprocessing
 from zsdata.synthesis.disparity import AdaptiveDisparity
-from zsdata.worker import MOST_SPARES, SHORTEST_SIDE_PX, single_thread
+from zsdata.synthesis.synthesizer import NEAREST, SynthesisConfig, estimate_depth, given_depth
+from zsdata.worker import MOST_SPARES, SHORTEST_SIDE_PX, single_thread, store_depth
+
+logger = logging.getLogger("zsdata")
 
 
 class Source(Protocol):
@@ -67,7 +75,10 @@ class StereoSource:
         return self.pairs.place(index)
 
     def make(self, index: int, size: tuple[int, int], draw: Draw) -> Example:
-        return from_stereo(self.pairs.read(index), size, draw)
+        with Meter().stage("read"):  # may wait for a disk or a server
+            frame = self.pairs.read(index)
+        with Meter().stage("example"):
+            return from_stereo(frame, size, draw)
 
 
 class PhotoSource:
@@ -77,15 +88,30 @@ class PhotoSource:
         manifest: of the tars that hold the photos.
         depth: as `load_depth` takes it; or "stored", the maps beside the photos.
         scale: draws how far apart the cameras stand.
+        depth_cache: a folder that keeps the depth of every photo, so that it is estimated once and not in every epoch. Shared with streams
+            that weigh their labels by confidence, so depth of the mirrored photo is estimated and kept with it.
 
     Raises:
-        ValueError: "stored", and no photo has a map.
+        ValueError: "stored", and no photo has a map, or a cache is asked to keep the maps a second time.
         ImportError, OSError, ValueError: a network that cannot be loaded.
     """
 
-    def __init__(self, manifest: Manifest, depth: str | DepthEstimator, scale: AdaptiveDisparity) -> None:
+    def __init__(
+        self,
+        manifest: Manifest,
+        depth: str | DepthEstimator,
+        scale: AdaptiveDisparity,
+        depth_cache: str | os.PathLike[str] | None = None,
+    ) -> None:
+        if depth == STORED and depth_cache is not None:
+            raise ValueError(f'depth "{STORED}" is read from the tars, and a depth cache would keep it a second time; leave the cache out')
         self._manifest, self._name, self._scale = manifest, depth, scale
         self._depth: DepthEstimator | None = None
+        if manifest.problems:
+            first = manifest.problems[0]
+            logger.warning(
+                "%d faults in the tars of photos, the first: %s: %s", len(manifest.problems), first.key or first.shard, first.reason
+            )
         network = as_network(depth)
         if network is not None:
             load_preprocessing(network)  # what cannot be loaded fails here, and not in a worker
@@ -93,6 +119,9 @@ class PhotoSource:
             check_depth_maps("photos", manifest)
         elif depth == "builtin":
             warn_once()  # here, and not in every worker
+        self._cache: DepthCache | None = None
+        if depth_cache is not None:
+            self._cache = DepthCache(depth_cache, DEPTH_CACHE_BYTES, f"{depth_identity(depth)}, flip confidence")  # as a stream calls it
 
     @property
     def digest(self) -> str:
@@ -107,27 +136,48 @@ class PhotoSource:
         return member.shard_url, member.key
 
     def make(self, index: int, size: tuple[int, int], draw: Draw) -> Example:
-        file = PhotoFile(self._manifest.read(index))
+        with Meter().stage("read"):
+            stored = self._manifest.read_depth(index) if self._name == STORED else None
+            data = self._manifest.read(index)
+        with Meter().stage("example"):
+            return self._make(data, stored, size, draw)
+
+    def _make(self, data: bytes, stored: bytes | None, size: tuple[int, int], draw: Draw) -> Example:
+        file = PhotoFile(data)
         width, height, _ = file.header
         if min(height, width) < SHORTEST_SIDE_PX:
             raise BadPhoto(f"too small: a side shorter than {SHORTEST_SIDE_PX} px: {width}x{height}")
         photo = file.decode()
-        if self._name == STORED:
-            depth = torch.from_numpy(decode_depth(self._manifest.read_depth(index), file.header))[None, None]
+        if stored is not None:
+            depth = given_depth(torch.from_numpy(decode_depth(stored, file.header))[None, None]).inverse_depth
         else:
-            if self._depth is None:
+            depth = self._estimated(photo, data)
+        return from_photo(photo, depth.float() / NEAREST, self._scale, size, draw)
+
+    def _estimated(self, photo: np.ndarray, data: bytes) -> Tensor:
+        """Inverse depth as whole numbers, which come out of the cache as they went in."""
+        cache, digest = self._cache, ""
+        if cache is not None:
+            digest = photo_digest(data)
+            cached = cache.load(digest)
+            if cached is not None and cached.size == photo.shape[:2]:
+                return torch.from_numpy(cached.inverse_depth)[None, None]
+        if self._depth is None:
+            with Meter().stage("load"):  # may wait for a download
                 self._depth = load_depth(self._name)
-            image = torch.from_numpy(photo).permute(2, 0, 1)[None].to(torch.float32, memory_format=torch.contiguous_format)
-            with torch.inference_mode():
-                depth = self._depth(image)
-        return from_photo(photo, normalize_inverse_depth(depth), self._scale, size, draw)
+        image = torch.from_numpy(photo).permute(2, 0, 1)[None].to(torch.float32, memory_format=torch.contiguous_format)
+        with torch.inference_mode():
+            depth = estimate_depth(self._depth, image, SynthesisConfig(flip_confidence=cache is not None))
+        if cache is not None:
+            store_depth(cache, digest, depth)
+        return depth.inverse_depth
 
 
 @dataclass(frozen=True)
 class ExampleBatch:
     """Examples as they cross the process border: images uint8 [B, 3, H, W], `inpaint_mask` bool [B, 1, H, W], True in holes.
 
-    `requests` holds (step, index) of each, `places` where it comes from; `rejected` lists (source, place, name, reason) of what could
+    `requests` holds (step, index) of each, `meta` where it comes from; `rejected` lists (source, place, name, reason) of what could
     not be used. `right` is the truth; `warped` is 0 in its holes.
     """
 
@@ -135,7 +185,7 @@ class ExampleBatch:
     warped: Tensor
     inpaint_mask: Tensor
     requests: list[tuple[int, int]]
-    places: list[str]
+    meta: list[dict[str, Any]]  # epoch and index in it, source, shard (of pairs: their folder), key
     rejected: list[tuple[str, str, str, str]]
 
     @staticmethod
@@ -146,17 +196,12 @@ class ExampleBatch:
             warped=torch.cat([example.warped for example in examples]),
             inpaint_mask=torch.cat([example.inpaint_mask for example in examples]),
             requests=[request for example in examples for request in example.requests],
-            places=[place for example in examples for place in example.places],
+            meta=[meta for example in examples for meta in example.meta],
             rejected=[reject for example in examples for reject in example.rejected],
         )
 
-    def pin_memory(self) -> ExampleBatch:
-        """The same in page-locked memory (called by torch's DataLoader)."""
-        images = {name: getattr(self, name).pin_memory() for name in ("right", "warped", "inpaint_mask")}
-        return replace(self, **images)
 
-
-class Examples(Dataset):
+class Examples:
     """All examples of a training; (step, index of the step's batch) in, a batch of one out.
 
     Epoch after epoch goes through all sources in an order of its own; every pair and photo comes once in each.
@@ -179,7 +224,7 @@ class Examples(Dataset):
     def __getitem__(self, request: tuple[int, int]) -> ExampleBatch:
         """Raises NoUsablePhoto when no spare can be used either, RuntimeError when a step fails, with the example named."""
         step, index = request
-        epoch, place = divmod(step * self._batch_size + index, len(self))
+        epoch, place = self.place(step, index)
         draw = partial(rng, self._seed, step, index)
         rejected: list[tuple[str, str, str, str]] = []
         choice: Choice | None = self._plan.choose(epoch, place)
@@ -189,9 +234,8 @@ class Examples(Dataset):
                 where = source.place(choice.member)
                 try:
                     right, warped, inpaint_mask = source.make(choice.member, self.size, draw)
-                    return ExampleBatch(
-                        _to_uint8(right), _to_uint8(warped), inpaint_mask, [request], [f"{where[1]} in {where[0]}"], rejected
-                    )
+                    meta = {"epoch": epoch, "index": place, "source": name, "shard": where[0], "key": where[1]}
+                    return ExampleBatch(_to_uint8(right), _to_uint8(warped), inpaint_mask, [request], [meta], rejected)
                 except (BadPhoto, BadShard) as fault:
                     rejected.append((name, *where, fault.reason))
                 except Exception as error:
@@ -202,9 +246,17 @@ class Examples(Dataset):
             f"nothing usable for example {index} of step {step}: {len(rejected)} of {rejected[0][0]} were refused, the last ones: {last}"
         )
 
+    def place(self, step: int, index: int) -> tuple[int, int]:
+        """(epoch, place in it) of an example."""
+        return divmod(step * self._batch_size + index, len(self))
+
+    def sample(self, epoch: int, place: int) -> ExampleBatch:
+        """As `examples[step, index]`, by its epoch and its place in it."""
+        return self[divmod(epoch * len(self) + place, self._batch_size)]
+
     def position(self, step: int) -> Position:
         """The place before `step`: what a checkpoint keeps and checks."""
-        epoch, place = divmod(step * self._batch_size, len(self))
+        epoch, place = self.place(step, 0)
         digests = [(name, len(source), source.digest) for name, source in self._sources.items()]
         return Position(
             seed=self._seed,
@@ -213,15 +265,6 @@ class Examples(Dataset):
             manifest=hashlib.sha256(json.dumps(digests).encode()).hexdigest(),
             configuration=hashlib.sha256(json.dumps([self.size, self._batch_size]).encode()).hexdigest(),
         )
-
-
-def requests(
-    first_step: int, last_step: int, batch_size: int, micro_batch: int, rank: int, world_size: int
-) -> Iterator[list[tuple[int, int]]]:
-    """The batches of one rank: all ranks together get every example of a step once, `micro_batch` at a time."""
-    for step in range(first_step, last_step):
-        for start in range(rank * micro_batch, batch_size, world_size * micro_batch):
-            yield [(step, index) for index in range(start, start + micro_batch)]
 
 
 def _to_uint8(image: Tensor) -> Tensor:
