@@ -480,6 +480,7 @@ POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:abc\nsize 99\n
             r"its preprocessor_config\.json is no JSON .*; download it",
         ),
         (lambda folder: (folder / "preprocessor_config.json").write_text("[]"), r"holds options by name; got \[\]\. Download it again"),
+        (lambda folder: change(folder, "config.json", architectures=["DPTForSemanticSegmentation"]), r"is no depth network: .* DPTForSem"),
         (of_another_class, r"is no depth network: its config\.json says vit ViTForImageClassification; name one that"),
     ],
 )

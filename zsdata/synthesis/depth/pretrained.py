@@ -214,7 +214,8 @@ def load_preprocessing(network: DepthNetwork) -> Preprocessing:
         config = AutoConfig.from_pretrained(network.name, revision=network.revision)
         path = cached_file(network.name, "preprocessor_config.json", revision=network.revision)
     built_as = getattr(config, "architectures", None) or []
-    if type(config) not in MODEL_FOR_DEPTH_ESTIMATION_MAPPING or (built_as and not any("Depth" in one for one in built_as)):
+    for_depth = not built_as or any("Depth" in one or "Dense" in one for one in built_as)  # TIPSv2's may predict several things
+    if not for_depth or type(config) not in MODEL_FOR_DEPTH_ESTIMATION_MAPPING:
         raise ValueError(
             f'depth="{network.name}" is no depth network: its config.json says {" ".join([config.model_type, *built_as])}; name one that '
             "transformers loads by AutoModelForDepthEstimation"
