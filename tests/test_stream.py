@@ -337,6 +337,7 @@ def test_a_state_with_a_bad_place_is_refused(tar, value):
         (None, {"size": (384,)}, ValueError),
         (None, {"size": (8, 8)}, ValueError),
         (None, {"epoch_size": 0}, ValueError),
+        (None, {"epoch_size": 2**63}, ValueError),
     ],
 )
 def test_arguments_that_cannot_work_are_refused_at_once(tar, sources, options, error):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import torch
+from zsdata.synthesis.micro_batch import out_of_memory
 
 
 @contextmanager
@@ -17,6 +17,8 @@ def out_of_memory_is_cured_by(cure: str) -> Iterator[None]:
     """
     try:
         yield
-    except torch.OutOfMemoryError as error:
+    except RuntimeError as error:
+        if not out_of_memory(error):
+            raise
         said = str(error).splitlines() or ["out of memory"]
         raise MemoryError(f"the training does not fit into the device's memory: {cure}. {said[0]}") from error

@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shutil
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ FROZEN_PARTS = tuple(part for part in (*WEIGHTED_PARTS, *OTHER_PARTS) if part !=
 SMALL_PARTS = ("feature_extractor",)  # downloaded too: diffusers' own loader wants them, and they are a few kilobytes
 INDEX = "model_index.json"  # which pipeline it is, and its parts: {"vae": ["diffusers", "AutoencoderKL"], ...}
 CARD = ("README.md", "LICENSE*")  # they hold for a fine-tuned pipeline too
-LEFT_OUT = ("*.bin", "*.fp16.*", "*.non_ema.*", "*.msgpack", "*.onnx*")  # the same weights in other forms
+LEFT_OUT_ALWAYS = ("*.bin", "*.non_ema.*", "*.msgpack", "*.onnx*")  # the same weights in other forms
+LEFT_OUT = (*LEFT_OUT_ALWAYS, "*.fp16.*")
 
 
 def local_pipeline(name: str, subfolder: str = "", revision: str | None = None) -> Path:
@@ -50,7 +52,7 @@ def frozen_digest(folder: Path) -> str:
     """Changes with any file of what `write_pipeline` takes over and the U-Net is tuned for; a few seconds for a large pipeline."""
     digest = hashlib.sha256(usedforsecurity=False)
     for path in sorted(path for part in FROZEN_PARTS for path in (folder / part).rglob("*") if path.is_file()):
-        if not any(path.match(pattern) for pattern in LEFT_OUT):
+        if path.name not in _other_forms(str(path.parent), os.listdir(path.parent)):
             digest.update(f"{path.relative_to(folder).as_posix()} {path.stat().st_size}\n".encode())
             with path.open("rb") as file:
                 while block := file.read(2**20):
@@ -68,7 +70,7 @@ def write_pipeline(folder: Path, unet: Any, source: Path, subfolder: str = "") -
     index: dict[str, Any] = json.loads((inner / INDEX).read_text()) if (inner / INDEX).is_file() else {}
     more = [name for name, made_by in index.items() if isinstance(made_by, list) and name not in (UNET, *FROZEN_PARTS)]
     for part in (*FROZEN_PARTS, *(name for name in more if _is_whole(inner / name))):
-        shutil.copytree(inner / part, folder / part, ignore=shutil.ignore_patterns(*LEFT_OUT))
+        shutil.copytree(inner / part, folder / part, ignore=_other_forms)
     if index:
         index |= {name: [None, None] for name in more if not (folder / name).is_dir()}
         (folder / INDEX).write_text(json.dumps(index, indent=2) + "\n")
@@ -76,6 +78,12 @@ def write_pipeline(folder: Path, unet: Any, source: Path, subfolder: str = "") -
         for path in (path for pattern in CARD for path in place.glob(pattern) if path.is_file()):
             shutil.copyfile(path, folder / path.name)
     unet.save_pretrained(folder / UNET)
+
+
+def _other_forms(_: str, names: list[str]) -> set[str]:
+    """Which of a folder's files hold the same weights again; those in half precision only where there are others."""
+    patterns = LEFT_OUT if any(name.endswith(".safetensors") and ".fp16." not in name for name in names) else LEFT_OUT_ALWAYS
+    return {name for name in names if any(fnmatch(name, pattern) for pattern in patterns)}
 
 
 def _is_whole(part: Path) -> bool:

@@ -7,6 +7,7 @@ import json
 import logging
 import math
 import os
+import sys
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -76,9 +77,11 @@ class Schedule:
     """
 
     def __init__(self, sources: Any, seed: int, epoch_size: int | None, samples_per_photo: int = 1, *, stored_depth: bool = False) -> None:
-        if epoch_size is not None and (isinstance(epoch_size, bool) or not isinstance(epoch_size, int) or epoch_size < 1):
+        if epoch_size is not None and (
+            isinstance(epoch_size, bool) or not isinstance(epoch_size, int) or not 1 <= epoch_size <= sys.maxsize
+        ):
             raise ValueError(
-                f"epoch_size is a number of samples, 1 or more, or None for one exact pass over the photos; got {epoch_size!r}"
+                f"epoch_size is a number of samples, 1 to {sys.maxsize}, or None for one exact pass over the photos; got {epoch_size!r}"
             )
         self._seed = seed
         self._epoch_size = epoch_size

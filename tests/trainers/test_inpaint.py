@@ -548,6 +548,15 @@ def test_diffusers_itself_loads_what_is_written(pipeline, photos, tmp_path, safe
     assert json.loads((saved / "model_index.json").read_text())["image_encoder"] == [None, None]
 
 
+def test_a_pipeline_in_half_precision_alone_is_tuned_and_written_whole(pipeline, photos, tmp_path):
+    source = shutil.copytree(pipeline, tmp_path / "source")
+    for part in ("unet", "vae", "text_encoder"):
+        path = next((source / part).glob("*.safetensors"))
+        path.rename(path.with_name(path.name.replace(".safetensors", ".fp16.safetensors")))
+    saved = run(source, examples_of(photos=photos), tmp_path / "run", config(steps=1))
+    assert load_inpainter(saved, steps=2).steps == 2
+
+
 def test_the_licence_of_a_repository_goes_with_what_was_tuned_from_a_part_of_it(pipeline, photos, tmp_path):
     shutil.copytree(pipeline, tmp_path / "source" / "StereoGen")
     (tmp_path / "source" / "README.md").write_text("---\nlicense: mit\n---\n")

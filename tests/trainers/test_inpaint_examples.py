@@ -283,6 +283,16 @@ def test_depth_stored_beside_the_photos_gives_the_examples_of_the_estimator_that
         made("stored", photos)
 
 
+def test_a_strip_is_replaced_before_a_depth_network_sees_it_enlarged(tmp_path):
+    small = pytest.importorskip("tests.small_depth_networks")
+    network = small.save_small_network("depth_anything", tmp_path / "network")
+    members = {"a.jpg": jpeg(photo(1, 48, 64)), "strip.jpg": jpeg(photo(2, 48, 400))}
+    source = PhotoSource(build_manifest(write_tar(tmp_path / "a.tar", members)), network, AdaptiveDisparity())
+    examples = Examples({"photos": source}, (32, 48), 0, 2)
+    rejected = [reject for number in range(2) for reject in examples[0, number].rejected]
+    assert [(key, reason.split(":")[0]) for _, _, key, reason in rejected] == [("strip", "too long for the depth network")]
+
+
 def test_depth_is_estimated_once_and_a_stream_may_have_done_it(tmp_path):
     tar, calls = photo_tar(tmp_path / "photos.tar", 3, height=64, width=96), []
 

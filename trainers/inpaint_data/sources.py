@@ -33,6 +33,7 @@ from zsdata.synthesis.depth.builtin import warn_once
 from zsdata.synthesis.depth.cache import DepthCache, photo_digest
 from zsdata.synthesis.depth.identity import depth_identity
 from zsdata.synthesis.depth.options import STORED
+from zsdata.synthesis.depth.preprocessing import Preprocessing
 from zsdata.synthesis.depth.pretrained import load_preprocessing
 from zsdata.synthesis.disparity import AdaptiveDisparity
 from zsdata.synthesis.synthesizer import NEAREST, SynthesisConfig, estimate_depth, given_depth
@@ -113,8 +114,9 @@ class PhotoSource:
                 "%d faults in the tars of photos, the first: %s: %s", len(manifest.problems), first.key or first.shard, first.reason
             )
         network = as_network(depth)
+        self._preprocessing: Preprocessing | None = getattr(depth, "preprocessing", None)
         if network is not None:
-            load_preprocessing(network)  # what cannot be loaded fails here, and not in a worker
+            self._preprocessing = load_preprocessing(network)  # what cannot be loaded fails here, and not in a worker
         elif depth == STORED:
             check_depth_maps("photos", manifest)
         elif depth == "builtin":
@@ -147,6 +149,8 @@ class PhotoSource:
         width, height, _ = file.header
         if min(height, width) < SHORTEST_SIDE_PX:
             raise BadPhoto(f"too small: a side shorter than {SHORTEST_SIDE_PX} px: {width}x{height}")
+        if self._preprocessing is not None and (refused := self._preprocessing.refuses(height, width)) is not None:
+            raise BadPhoto(refused)
         photo = file.decode()
         if stored is not None:
             depth = given_depth(torch.from_numpy(decode_depth(stored, file.header))[None, None]).inverse_depth
