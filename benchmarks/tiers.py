@@ -158,10 +158,10 @@ def matmul_tflops(device: torch.device, dtype: torch.dtype, options: argparse.Na
 
 
 def measure_inpainting(folder: Path, device: torch.device, matmul: float, options: argparse.Namespace) -> list[dict[str, Any]]:
-    save_pipeline(folder / "pipeline", device, options.smoke)
     height, width = options.size
     right, inpaint_mask = images_with_holes(options.micro_batch, height, width + INPAINT_CONTEXT_PX, device)
     rows = [measure_builtin(right, inpaint_mask, options)]
+    save_pipeline(folder / "pipeline", device, options.smoke)  # gigabytes, which the system is busy with for a while
     stages = [f"{stage} ms" for stage in STAGES]
     print_row(("tier", "autoencoder", "pairs/s", "target", *stages, "TFLOP", "TFLOP/s", "of matmul", "peak GiB", "micro-batch"))
     print_row(("built-in", "", f"{rows[0]['pairs_per_second']:.1f}", *[""] * 7, gib(rows[0]["peak_bytes"]), options.micro_batch))
