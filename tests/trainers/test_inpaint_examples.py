@@ -378,6 +378,7 @@ def test_batches_are_the_same_whoever_makes_them_and_come_in_the_order_of_their_
 
 
 def test_what_goes_wrong_in_a_worker_arrives_as_itself_and_in_one_line():
+    before = set(psutil.Process().children())  # of other tests: Python's fork server stays
     nothing = Examples({"pairs": StereoSource(Pairs(broken=(0, 1, 2)))}, (32, 48), 0, 4)
     with making(nothing, requests(0, 4, 4, 2, 0, 1), 1, torch.device("cpu")) as batches:
         with pytest.raises(NoUsablePhoto, match=r"^nothing usable for example 0 of step 0: 3 of pairs were refused, .*$"):
@@ -391,4 +392,4 @@ def test_what_goes_wrong_in_a_worker_arrives_as_itself_and_in_one_line():
     with making(killing, requests(2, 4, 4, 2, 0, 1), 1, torch.device("cpu")) as batches:
         with pytest.raises(WorkerLost, match=r"worker 0 of 1 .* was killed by SIGKILL; it was at sample 2 of epoch 2.*memory runs out"):
             next(batches)
-    assert not psutil.Process().children()
+    assert set(psutil.Process().children()) <= before
