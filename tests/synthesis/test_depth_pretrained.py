@@ -515,7 +515,8 @@ def test_a_preprocessing_that_makes_no_sense_is_named(copy, option, value, wante
 def test_weights_of_another_shape_are_named(copy):
     change(copy, "config.json", head_hidden_size=16)
     with pytest.raises(
-        ValueError, match=r'^depth=".*" has 3 weights of another shape than its config\.json says, "head\.conv2\.bias" for one'
+        ValueError,  # older transformers find it themselves
+        match=r'^depth=".*" (has 3 weights of another shape than its config\.json says, "head\.conv2\.bias"|cannot be loaded: Error)',
     ):
         load_depth(copy)
 

@@ -508,7 +508,7 @@ def test_damaged_and_incomplete_weights_are_named(copy, part):
     gone = sorted(weights)[0]
     del weights[gone]
     save_file(weights, path, metadata={"format": "pt"})
-    with pytest.raises(ValueError, match=re.escape(gone)):
+    with pytest.raises((ValueError, OSError), match=re.escape(gone)):  # older diffusers find it themselves
         load_inpainter(copy)
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(OSError, match=f"{part} cannot be loaded"):
