@@ -102,9 +102,19 @@ def glpn() -> Any:
     return hf.GLPNForDepthEstimation(config)
 
 
-def zoe() -> Any:
+def zoe(domains: list[dict[str, Any]] | None = None) -> Any:
     head = {"bottleneck_features": 16, "num_relative_features": 8, "bin_embedding_dim": 16, "num_attractors": [4, 2, 2, 1]}
+    if domains is not None:
+        sizes = {"hidden_size": 16, "intermediate_size": 16, "num_attention_heads": 2}
+        head |= {"bin_configurations": domains, "num_patch_transformer_layers": 4}
+        head |= {f"patch_transformer_{name}": size for name, size in sizes.items()}
     return hf.ZoeDepthForDepthEstimation(hf.ZoeDepthConfig(backbone_config=beit(), backbone_hidden_size=32, **NECK, **head))
+
+
+def zoe_of_two_domains() -> Any:
+    """As published for indoors and outdoors."""
+    bins = {"n_bins": 8, "min_depth": 0.001}
+    return zoe([{"name": "nyu", "max_depth": 10.0, **bins}, {"name": "kitti", "max_depth": 80.0, **bins}])
 
 
 def depth_pro() -> Any:

@@ -512,6 +512,17 @@ def test_a_preprocessing_that_makes_no_sense_is_named(copy, option, value, wante
         load_preprocessing(DepthNetwork(str(copy)))
 
 
+def test_a_network_that_chooses_one_domain_for_all_images_is_given_one(folders, tmp_path, monkeypatch):
+    """As a GPU would be asked, which takes many at once: a photo's depth must not hang on its neighbours."""
+    one_domain, asked, batch = folders("zoe"), [], pretrained.MicroBatch
+    monkeypatch.setattr(pretrained, "MicroBatch", lambda what, size, *rest: asked.append(size) or batch(what, size, *rest))
+    monkeypatch.setitem(small.NETWORKS, "zoe", (small.zoe_of_two_domains, *small.NETWORKS["zoe"][1:]))
+    two_domains = small.save_small_network("zoe", tmp_path / "zoe")
+    load_depth(one_domain, micro_batch=4)
+    load_depth(two_domains, micro_batch=4)(torch.rand(1, 3, 64, 96) * 255)
+    assert asked == [4, 1]
+
+
 def test_weights_of_another_shape_are_named(copy):
     change(copy, "config.json", head_hidden_size=16)
     with pytest.raises(

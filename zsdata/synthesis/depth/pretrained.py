@@ -89,7 +89,9 @@ class PretrainedDepth:
                     _keep_in_float32(layers[name], self.device.type)
         if network.compile:
             self._network.compile()
-        self.micro_batch = MicroBatch("depth network", network.micro_batch, self.device, cure)
+        # A ZoeDepth of two domains, indoors and outdoors, chooses one for all images that it is given at once.
+        alone = len(getattr(loaded.config, "bin_configurations", None) or ()) > 1
+        self.micro_batch = MicroBatch("depth network", 1 if alone else network.micro_batch, self.device, cure)
 
     def prepare(self, images: Tensor) -> Tensor:
         """The first half: photos to the network's input.
@@ -238,7 +240,7 @@ def _naming(network: DepthNetwork) -> Iterator[None]:
         yield
     except OSError as error:
         raise OSError(f"{which} cannot be loaded: {error}") from error
-    except ImportError:  # names the package that a network needs beside transformers
+    except (ImportError, MemoryError):  # names the package that a network needs beside transformers; is no fault of the folder
         raise
     except Exception as error:  # what a damaged folder leads to is not foretold
         raise ValueError(
