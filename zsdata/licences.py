@@ -20,7 +20,6 @@ from zsdata.synthesis.depth.options import STORED, DepthNetwork
 from zsdata.synthesis.inpaint.options import DiffusionNetwork
 
 CARD = "README.md"
-HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
 OWN_LICENCE = "apache-2.0"
 BUILT_IN = ("builtin", "background")
 
@@ -122,13 +121,13 @@ def fetch_cards(*steps: Any) -> None:
         steps: as `model_records` takes them.
     """
     for name, revision, _ in (model for step in steps for model in _models(step)):
-        if name in (*BUILT_IN, STORED) or os.path.isdir(name) or name.lower() in KNOWN or not HUB_ID.fullmatch(name):
+        if name in (*BUILT_IN, STORED) or os.path.isdir(name) or name.lower() in KNOWN:
             continue
-        if try_to_load_from_cache(name, CARD, revision=revision) is None:  # neither there nor known to be missing
-            try:
+        try:
+            if try_to_load_from_cache(name, CARD, revision=revision) is None:  # neither there nor known to be missing
                 hf_hub_download(name, CARD, revision=revision)
-            except (OSError, ValueError, HfHubHTTPError):  # no network, no such repository, no card; loading the model says what is wrong
-                continue
+        except (OSError, ValueError, HfHubHTTPError):  # no network, no Hub id, no card: loading the model says what is wrong
+            continue
 
 
 def require_commercial(step: Any, argument: str) -> None:
