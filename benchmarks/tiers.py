@@ -112,7 +112,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for library in (diffusers, transformers):
         library.logging.set_verbosity_error()  # what they say of made-up configurations
         library.logging.disable_progress_bar()
-    name = cpu_name() if device.type == "cpu" else torch.cuda.get_device_name(device)
+    cpu = f"{platform.processor() or platform.machine()}, {torch.get_num_threads()} threads"
+    name = cpu if device.type == "cpu" else torch.cuda.get_device_name(device)
     dtype = choose_dtype(options.dtype, device)
     options.dtype = str(dtype).removeprefix("torch.")  # depth has no other format on a GPU by itself
     matmul = matmul_tflops(device, dtype, options)
@@ -137,16 +138,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 indent=2,
             )
         )
-
-
-def cpu_name() -> str:
-    """As the system calls it, with the threads that torch takes."""
-    cpu = platform.processor() or platform.machine()
-    try:
-        cpu = next(line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name"))
-    except (OSError, StopIteration):
-        pass
-    return f"{cpu}, {torch.get_num_threads()} threads"
 
 
 def matmul_tflops(device: torch.device, dtype: torch.dtype, options: argparse.Namespace) -> float:
