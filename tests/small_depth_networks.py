@@ -105,7 +105,7 @@ def glpn() -> Any:
 def zoe(domains: list[dict[str, Any]] | None = None) -> Any:
     head = {"bottleneck_features": 16, "num_relative_features": 8, "bin_embedding_dim": 16, "num_attractors": [4, 2, 2, 1]}
     if domains is not None:
-        sizes = {"hidden_size": 16, "intermediate_size": 16, "num_attention_heads": 2}
+        sizes = {"hidden_size": 128, "intermediate_size": 16, "num_attention_heads": 2}
         head |= {"bin_configurations": domains, "num_patch_transformer_layers": 4}
         head |= {f"patch_transformer_{name}": size for name, size in sizes.items()}
     return hf.ZoeDepthForDepthEstimation(hf.ZoeDepthConfig(backbone_config=beit(), backbone_hidden_size=32, **NECK, **head))
