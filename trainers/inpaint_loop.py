@@ -18,7 +18,7 @@ from accelerate.utils import gather_object
 from torch import Tensor
 
 from trainers import run_folder
-from trainers.accelerated import open_accelerator
+from trainers.accelerated import load_optimizer_state, open_accelerator, optimizer_state
 from trainers.hole_scores import HoleCase, hole_cases, mean_hole_scores, score_holes
 from trainers.inpaint_data.batches import making, requests
 from trainers.inpaint_data.sources import ExampleBatch, Examples
@@ -153,17 +153,13 @@ def tune(
         cycle_momentum=False,
         anneal_strategy="linear",
     )
-    if training is not None:
-        optimizer.load_state_dict(training["optimizer"])
-        schedule.load_state_dict(training["schedule"])
     model, optimizer = accelerator.prepare(unet, optimizer)
-    if training is not None and accelerator.scaler is not None and training["scaler"]:
-        accelerator.scaler.load_state_dict(training["scaler"])
-    if average is not None:
-        average.to(accelerator.device)
     guard = StepGuard(accelerator, unet, output / "skipped.jsonl", hint="shard and key say where they lie")
     if training is not None:
+        load_optimizer_state(training, optimizer, schedule, accelerator)
         guard.load_state_dict(state["guard"])
+    if average is not None:
+        average.to(accelerator.device)
 
     output.mkdir(parents=True, exist_ok=True)
     if tracker is not None:
@@ -183,12 +179,7 @@ def tune(
                     output,
                     step,
                     lambda folder: write_pipeline(folder / PIPELINE, unet, pipeline, subfolder),
-                    {
-                        "weights": raw,
-                        "optimizer": optimizer.state_dict(),
-                        "schedule": schedule.state_dict(),
-                        "scaler": accelerator.scaler.state_dict() if accelerator.scaler is not None else {},
-                    },
+                    {"weights": raw, **optimizer_state(optimizer, schedule, accelerator)},
                     {
                         "examples": examples.position(step).to_state(),
                         "options": options,

@@ -15,7 +15,7 @@ from accelerate.utils import gather_object
 from torch import Tensor
 
 from trainers import run_folder
-from trainers.accelerated import open_accelerator
+from trainers.accelerated import load_optimizer_state, open_accelerator, optimizer_state
 from trainers.evaluate import mean_scores, table
 from trainers.memory import out_of_memory_is_cured_by
 from trainers.models import Matcher, load_checkpoint
@@ -146,8 +146,6 @@ def train(
     if training is not None:
         if training["weights"]:  # what was saved for use is the average
             matcher.load_state_dict(training["weights"])
-        optimizer.load_state_dict(training["optimizer"])
-        schedule.load_state_dict(training["schedule"])
         loader.load_state_dict(state["stream"])
         validation.load_state_dict(state["validation"])
         step = state["step"]
@@ -159,9 +157,8 @@ def train(
     model.train()
     guard = StepGuard(accelerator, matcher, output / "skipped.jsonl")
     if training is not None:
+        load_optimizer_state(training, optimizer, schedule, accelerator)
         guard.load_state_dict(state["guard"])
-        if accelerator.scaler is not None and training["scaler"]:
-            accelerator.scaler.load_state_dict(training["scaler"])
     if average is not None:
         average.to(accelerator.device)
     if tracker is not None:
@@ -175,12 +172,7 @@ def train(
                     step,
                     matcher,
                     model_config,
-                    {
-                        "weights": weights,
-                        "optimizer": optimizer.state_dict(),
-                        "schedule": schedule.state_dict(),
-                        "scaler": accelerator.scaler.state_dict() if accelerator.scaler is not None else {},
-                    },
+                    {"weights": weights, **optimizer_state(optimizer, schedule, accelerator)},
                     {
                         "stream": loader.state_dict(),
                         "validation": validation.state_dict(),
