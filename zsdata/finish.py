@@ -19,7 +19,7 @@ from zsdata.meter import Meter
 from zsdata.prepared import Draft, Drafts, Prepared, make
 from zsdata.sample import Masks, StereoBatch
 from zsdata.seeding import rng
-from zsdata.synthesis.depth import DepthEstimator, as_network
+from zsdata.synthesis.depth import DepthEstimator
 from zsdata.synthesis.inpaint import Inpainter, fill
 from zsdata.synthesis.synthesizer import INPAINT_CONTEXT_PX, DepthMaps, estimate_depth, predict_depth
 from zsdata.worker import Recipe, Worker, naming, single_thread, store_depth
@@ -65,12 +65,12 @@ class Synthesis:
 
     @torch.no_grad()
     def _estimate(self, drafts: dict[tuple[str, str], Draft], device: torch.device) -> dict[tuple[str, str], DepthMaps]:
-        """Depth of the photos of these drafts: by a network with two halves all in one go, otherwise one by one."""
+        """Depth of the photos of these drafts: by a network, whose first half the workers did, all in one go; otherwise one by one."""
         if self.depth is None:
             return {}
         config = self.recipe.synthesis
         photos = [draft.photo.to(device, non_blocking=True) for draft in drafts.values() if draft.photo is not None]
-        if as_network(self.recipe.depth) is not None:
+        if self.recipe.preprocessing is not None:
             with _naming_photos(drafts):
                 maps = predict_depth(self.depth, photos, [tuple(draft.meta["photo_size"]) for draft in drafts.values()], config)
         else:

@@ -34,7 +34,7 @@ from zsdata.synthesis.depth.builtin import warn_once
 from zsdata.synthesis.depth.cache import DepthCache
 from zsdata.synthesis.depth.identity import depth_identity, pinned
 from zsdata.synthesis.depth.options import STORED
-from zsdata.synthesis.depth.pretrained import load_preprocessing
+from zsdata.synthesis.depth.pretrained import PretrainedDepth, load_preprocessing
 from zsdata.synthesis.disparity import AdaptiveDisparity, UniformDisparity
 from zsdata.synthesis.inpaint import DiffusionNetwork, Inpainter, load_inpainter
 from zsdata.synthesis.micro_batch import WarmUp, say_warm_up
@@ -171,6 +171,9 @@ class ZeroStereoStream(IterableDataset):
         if network is not None:
             preprocessing = load_preprocessing(network)
             depth = pinned(network)
+        elif isinstance(depth, PretrainedDepth):
+            preprocessing = depth.preprocessing
+        self._pinned_depth = depth
         synthesis = synthesis if synthesis is not None else SynthesisConfig()
         self._recipe = Recipe(
             seed=seed,
@@ -278,14 +281,14 @@ class ZeroStereoStream(IterableDataset):
         device = torch.device(device)
         on_device = self._depth_placement == "device"
         if self._depth_placement == "auto":
-            on_device = self._depth_elsewhere or (device.type != "cpu" and as_network(self._recipe.depth) is not None)
+            on_device = self._depth_elsewhere or (device.type != "cpu" and as_network(self._pinned_depth) is not None)
         finisher = self._finisher(device, micro_batch, on_device)
         if device.type != "cpu" and self._recipe.size is not None:
             ready = [said for said in finisher.warm_up(self._recipe.size, batch_size) if isinstance(said, WarmUp)]
             if ready and rank == 0:
                 Progress.write(say_warm_up(ready, device), file=sys.stderr)
         return StereoLoader(
-            worker=Worker(replace(self._recipe, depth_on_device=True)) if on_device else self._worker,
+            worker=self._drafter() if on_device else self._worker,
             finisher=finisher,
             place=lambda: self._place(0, 0),
             revision=lambda: self._revision,
@@ -336,7 +339,7 @@ class ZeroStereoStream(IterableDataset):
             "seed": place.seed,
             "manifest": place.manifest,
             "configuration": place.configuration,
-            "depth": model_records(self._recipe.depth),
+            "depth": model_records(self._pinned_depth),
             "inpaint": model_records(self._inpaint),
         }
 
@@ -372,10 +375,14 @@ class ZeroStereoStream(IterableDataset):
         recipe = self._recipe
         synthesis = None
         if depth_on_device:
-            recipe = replace(recipe, depth_on_device=True)
-            estimator = None if recipe.depth == STORED else load_depth(recipe.depth, device)
-            synthesis = Synthesis(estimator, recipe, Worker(recipe))
+            estimator = None if self._pinned_depth == STORED else load_depth(self._pinned_depth, device)
+            synthesis = Synthesis(estimator, recipe, self._drafter())
         return Finisher(load_inpainter(self._inpaint, device), self._augmentation, micro_batch, device, synthesis, recipe.reuse)
+
+    def _drafter(self) -> Worker:
+        """Prepares all but depth; an estimator that was given loaded does not travel to processes that have no use for it."""
+        depth = None if callable(self._pinned_depth) else self._pinned_depth
+        return Worker(replace(self._recipe, depth=depth, depth_on_device=True))
 
     def _place(self, epoch: int, samples: int) -> Position:
         recipe = self._recipe

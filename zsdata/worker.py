@@ -42,8 +42,8 @@ class Recipe:
     seed: int
     size: tuple[int, int] | None  # None: each photo whole, at its own size
     schedule: Schedule
-    depth: str | DepthNetwork | DepthEstimator
-    preprocessing: Preprocessing | None  # of a depth network
+    depth: str | DepthNetwork | DepthEstimator | None  # None: an estimator of the device's own
+    preprocessing: Preprocessing | None  # of a depth network, by its name or loaded
     depth_cache: DepthCache | None
     disparity: AdaptiveDisparity | UniformDisparity
     view: ViewConfig
@@ -83,7 +83,6 @@ class Worker:
     def __init__(self, recipe: Recipe) -> None:
         self._recipe = recipe
         self._depth: DepthEstimator | None = None
-        self._preprocessing: Preprocessing | None = recipe.preprocessing or getattr(recipe.depth, "preprocessing", None)
         self._last: tuple[tuple[str, int], _Photo] | None = None  # the photo whose next view comes next
         self._last_pair: tuple[tuple[SourceSet, int, int], Prepared | Draft] | None = None
 
@@ -203,7 +202,8 @@ class Worker:
             data = manifest.read(choice.member, self._recipe.shard_cache)
         with meter.stage("decode"):
             photo = _Photo(data, stored_depth)
-        refused = None if self._preprocessing is None else self._preprocessing.refuses(*photo.size)
+        preprocessing = self._recipe.preprocessing
+        refused = None if preprocessing is None else preprocessing.refuses(*photo.size)
         if refused is not None:
             raise BadPhoto(refused)
         self._last = (key, photo) if sources.plan.samples_per_photo > 1 else None
@@ -224,6 +224,7 @@ class Worker:
         if self._recipe.depth_on_device:
             return None
         if self._depth is None:
+            assert self._recipe.depth is not None  # only the device has none to give
             with Meter().stage("load"):  # may wait for a download
                 self._depth = load_depth(self._recipe.depth)
         with torch.inference_mode():
