@@ -134,21 +134,22 @@ def make(draft: Draft, depth: DepthMaps, needs: Sequence[str], config: Synthesis
         context["right_disparity"] = made.right_disparity[0].contiguous()
     hole = made.inpaint_mask[..., :width]
     disparity, nonocclusion = made.disparity[0].contiguous(), made.nonocclusion_mask[0].contiguous()
-    least, largest = float(disparity.amin()), float(disparity.amax())
+    least, largest = torch.stack((disparity.amin(), disparity.amax())).tolist()  # on a GPU one wait for both
+    consistency = float(depth.consistency[0])
     hole_share = count_true(hole) / hole.numel()
     reason = gate.refuses(
         hole_share=hole_share,
         visible_share=count_true(nonocclusion) / nonocclusion.numel(),
         disparity_range_px=largest - least,
         drawn_px=draft.scale * depth.inverse_depth.shape[-1] * draft.view.scale_x,
-        flip_consistency=float(depth.consistency[0]),
+        flip_consistency=consistency,
     )
     if reason is not None:
         raise BadPhoto(reason)
     meta = {
         **draft.meta,
         "largest_disparity_px": largest,
-        "flip_consistency": round(float(depth.consistency[0]), 6),
+        "flip_consistency": round(consistency, 6),
         "hole_share": hole_share,
     }
     return Prepared(

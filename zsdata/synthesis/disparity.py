@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -147,6 +149,26 @@ class _Frame:
         return table.view(-1).index_copy_(0, edge, of_edge)
 
 
+class _NearRows(NamedTuple):
+    """The R rows that are searched at once, and a choice for each row and side, 2 R. They stand in the order of preference at equal
+    distance: nearer rows, the row above, the left side."""
+
+    row_steps: Tensor  # int64 [R, 1]
+    order: Tensor  # int16 [R, 1]: the part of a choice's key that depends on its row
+    row_step_of_choice: Tensor  # int64 [2 R]
+    side_of_choice: Tensor  # int64 [2 R], -1 or 1
+
+    @staticmethod
+    @cache
+    def on(device: torch.device) -> _NearRows:
+        """Kept, because a GPU waits for whatever is brought there."""
+        steps = torch.tensor(sorted(range(-NEAR_ROWS, NEAR_ROWS + 1), key=abs)).unsqueeze(1)
+        choices = torch.arange(2 * len(steps))
+        order = 2 * len(steps) * steps**2 + choices[::2].unsqueeze(1)
+        tables = steps, order.to(torch.int16), steps.expand(-1, 2).flatten(), choices % 2 * 2 - 1
+        return _NearRows(*(table.to(device) for table in tables))
+
+
 def _nearest_values(edge: Tensor, frame: _Frame) -> Tensor:
     """Where each edge takes its value from. Places are indices into the flattened, padded maps, int64; those of the edges ascend."""
     begins = torch.ones(edge.shape[0] + 1, dtype=torch.bool, device=edge.device)  # a run of edges in one row, or ends them all
@@ -161,18 +183,16 @@ def _nearest_values(edge: Tensor, frame: _Frame) -> Tensor:
         right = after + (after % frame.columns == frame.columns - 1) * none
         return (edge - left.index_select(0, run)).clamp_(max=none), (right.index_select(0, run) - edge).clamp_(max=none)
 
-    # Near rows, all at once. Candidates stand in the order of preference at equal distance: nearer rows, the row above, the left one.
-    row_steps = sorted(range(-NEAR_ROWS, NEAR_ROWS + 1), key=abs)
-    there = (edge + frame.columns * edge.new_tensor(row_steps).unsqueeze(1)).flatten()
-    count = 2 * len(row_steps)
+    # Near rows, all at once.
+    near = _NearRows.on(edge.device)
+    count = len(near.side_of_choice)
+    there = (edge + frame.columns * near.row_steps).flatten()
     left, right = columns_off(NOT_NEAR_PX)
     best_of_row = frame.table(edge, torch.minimum(count * left * left, count * right * right + 1).to(torch.int16), count * NOT_NEAR_PX**2)
-    order = [count * step**2 + 2 * place for place, step in enumerate(row_steps)]
-    key = best_of_row.index_select(0, there).view(len(row_steps), -1).add_(best_of_row.new_tensor(order).unsqueeze(1)).amin(0).long()
+    key = best_of_row.index_select(0, there).view(len(near.row_steps), -1).add_(near.order).amin(0).long()
     square = torch.div(key, count, rounding_mode="floor")
     choice = key.sub_(square, alpha=count)
-    tables = [step for step in row_steps for _ in (0, 1)], [-1, 1] * len(row_steps)
-    row_step, side = (edge.new_tensor(table).index_select(0, choice) for table in tables)
+    row_step, side = near.row_step_of_choice.index_select(0, choice), near.side_of_choice.index_select(0, choice)
     column_step = (square - row_step * row_step).float().sqrt_().long()
     found = row_step.mul_(frame.columns).add_(edge).add_(column_step.mul_(side))
 

@@ -365,7 +365,8 @@ def _colours(planes: Tensor, surfaces: _Surfaces, special: _Special, limits: Ten
     colours[:1].zero_()
     ordinary = colours[1 : 1 + count]
     images = ordinary.view(len(limits), -1)
-    least_and_largest = limits[0].tolist() if len(limits) == 1 else (limits[:, :1], limits[:, 1:])  # numbers are the fastest
+    on_cpu = limits.device.type == "cpu"  # there numbers are the fastest, and images come one by one
+    least_and_largest = limits[0].tolist() if on_cpu else (limits[:, :1], limits[:, 1:])
     for plane, other in zip(planes, others, strict=True):
         values.copy_(plane)
         torch.sub(values[1:], values[:-1], out=change[1:-2])
@@ -396,7 +397,7 @@ def _special_colours(planes: Tensor, joined: Tensor, special: _Special, limits: 
     places = (source + torch.arange(-1, 3, device=source.device).unsqueeze(1)).clamp_(0, planes.shape[1] - 1).flatten()
     taps = torch.stack([plane.index_select(0, places) for plane in planes]).to(_arithmetic(planes)).view(len(planes), 4, -1)
     colours = weights.cubic(taps[:, 1], taps.diff(dim=1).unbind(1))
-    if len(limits) == 1:
+    if limits.device.type == "cpu":  # one image
         return colours.clamp_(*limits[0].tolist())
     image = torch.div(source, planes.shape[1] // len(limits), rounding_mode="floor")
     return colours.clamp_(*limits.index_select(0, image).unbind(1))

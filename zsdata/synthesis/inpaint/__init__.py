@@ -83,11 +83,13 @@ def fill(
     with_holes = inpaint_mask.flatten(1).any(1).nonzero().flatten().tolist()
     at_once = max(1, len(with_holes)) if micro_batch is None else micro_batch
     for start in range(0, len(with_holes), at_once):
-        part = with_holes[start : start + at_once]
+        places = with_holes[start : start + at_once]
+        part = torch.tensor(places, device=right.device)
+        expected = (len(places), *right.shape[1:])
         extra = {name: context[name][part] for name in getattr(inpainter, "needs", ())}
-        made = inpainter(right[part], inpaint_mask[part], [generators[i] for i in part], **extra)
-        if made.shape != right[part].shape:
-            raise ValueError(f"the inpainter must return {list(right[part].shape)}; got {list(made.shape)}")
+        made = inpainter(right[part], inpaint_mask[part], [generators[place] for place in places], **extra)
+        if made.shape != expected:
+            raise ValueError(f"the inpainter must return {list(expected)}; got {list(made.shape)}")
         if made.device != right.device:
             raise ValueError(f"the inpainter must return its images on {right.device}, where it gets them; got {made.device}")
         if not torch.isfinite(made).all():

@@ -26,6 +26,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from zsdata.synthesis.indices import flat_indices
+
 SURFACE_PX = 3.0  # pixels whose disparities differ by at most this are taken for one surface
 SPECK_PX = 2  # known pixels inside a hole, not more in a row, that are nearer than what follows: noise of the disparity, no edge
 NEAR_PX, FAR_PX = 2, 4  # how much of the background gives a run's colour: close to the edge, and far from it
@@ -69,7 +71,7 @@ class BuiltinInpainter:
         _check(right, inpaint_mask, right_disparity)
         batch, channels, height, width = right.shape
         hole = inpaint_mask.reshape(-1)
-        pixel = hole.nonzero().squeeze(1)
+        pixel = flat_indices(hole)
         if len(pixel) == 0:
             return right.clone()
         colours = right.float().masked_fill(inpaint_mask, 0).transpose(0, 1).reshape(channels, -1)
@@ -112,7 +114,7 @@ def _find_runs(pixel: Tensor, surface: Tensor, width: int, trust_specks: bool) -
     begins[1:] = (pixel.diff() != 1) | (row_of_pixel.diff() != 0)
     ends = torch.ones_like(begins)
     ends[:-1] = begins[1:]
-    first, last = pixel[begins], pixel[ends]
+    first, last = pixel[flat_indices(begins)], pixel[flat_indices(ends)]
     row = first - first % width
     has_left, has_right = first > row, last < row + width - 1
     left, right = (first - 1).clamp_(min=0), (last + 1).clamp_(max=len(surface) - 1)
@@ -124,6 +126,7 @@ def _find_runs(pixel: Tensor, surface: Tensor, width: int, trust_specks: bool) -
     opens, closes = torch.cat([whole, ~linked]), torch.cat([~linked, whole])
     run_of_pixel = (opens.cumsum(0) - 1)[begins.cumsum(0) - 1]
 
+    opens, closes = flat_indices(opens), flat_indices(closes)
     first, row, left, has_left = first[opens], row[opens], left[opens], has_left[opens]
     last, right, has_right = last[closes], right[closes], has_right[closes]
     to_right = has_right & (~has_left | (surface[right] <= surface[left]))
