@@ -58,7 +58,8 @@ class Synthesis:
         return replace(pairs, meta=meta, rejected=rejected, seconds=drafts.seconds, rows=drafts.rows)
 
     def _make(self, draft: Draft, depth: DepthMaps, device: torch.device, meter: Meter) -> Prepared:
-        depth = depth._replace(inverse_depth=depth.inverse_depth.to(device), confidence=depth.confidence.to(device))
+        inverse_depth, confidence = (values.to(device, non_blocking=True) for values in (depth.inverse_depth, depth.confidence))
+        depth = depth._replace(inverse_depth=inverse_depth, confidence=confidence)
         draft = replace(draft, left=draft.left.to(device, non_blocking=True))
         with naming(draft.meta):
             return make(draft, depth, self.recipe.inpainter_needs, self.recipe.synthesis, self.recipe.gate, meter)

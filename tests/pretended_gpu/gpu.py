@@ -154,7 +154,7 @@ def _deepcopy(tensor: OnGpu, known: dict[int, Any]) -> Tensor:
 
 
 def _get_item(tensor: OnGpu, index: Any) -> Tensor:
-    return Tensor.__getitem__(tensor, tree_map(lambda leaf: leaf, _without_lists(index)))
+    return Tensor.__getitem__(tensor, _without_lists(index))
 
 
 def _set_item(tensor: OnGpu, index: Any, value: Any) -> None:
@@ -222,21 +222,6 @@ class _SafeOpen:
 
     def get_tensors(self) -> dict[str, Tensor]:
         return {name: self.get_tensor(name) for name in self._file.keys()}
-
-    def get_slice(self, name: str) -> Any:
-        return _Slice(self._file.get_slice(name))
-
-
-class _Slice:
-    def __init__(self, inner: Any) -> None:
-        self._inner = inner
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._inner, name)
-
-    def __getitem__(self, index: Any) -> Tensor:
-        with _as_if_there_were_no_gpu():
-            return self._inner[index]
 
 
 PROPERTIES = SimpleNamespace(name="pretended", major=9, minor=0, total_memory=80 << 30, multi_processor_count=132)
