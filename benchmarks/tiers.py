@@ -90,8 +90,8 @@ SMALL_DEPTH_ANYTHING = {"Tiny": (32, 4, 2, [8, 16, 24, 32], 16, [1, 2, 3, 4])}
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda", help="default: cuda")
-    parser.add_argument("--smoke", action="store_true", help="small networks in float32 on the CPU")
+    parser.add_argument("--device", choices=("cuda", "cpu"), help="default: cuda, with --smoke cpu")
+    parser.add_argument("--smoke", action="store_true", help="small networks: does it run at all")
     parser.add_argument(
         "--size", type=int, nargs=2, default=(384, 512), metavar=("HEIGHT", "WIDTH"), help="of the pairs (default: 384 512)"
     )
@@ -102,9 +102,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--tiers", type=int, nargs="+", default=TIERS, metavar="STEPS", help="default: 1 4 8 50")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also writes the figures there")
     options = parser.parse_args(arguments)
+    options.device = options.device or ("cpu" if options.smoke else "cuda")
     if options.smoke:
-        options.device, options.size, options.micro_batch, options.repeats, options.tiers = "cpu", (64, 96), 2, 1, [1, 4]
-    elif options.device == "cuda" and not torch.cuda.is_available():
+        options.size, options.micro_batch, options.repeats, options.tiers = (64, 96), 2, 1, [1, 4]
+    if options.device == "cuda" and not torch.cuda.is_available():
         parser.error("torch finds no GPU; --device cpu runs the full-size networks on the CPU (half an hour), --smoke small ones")
     device = torch.device(options.device)
     options.micro_batch = options.micro_batch or (1 if device.type == "cpu" else 8)

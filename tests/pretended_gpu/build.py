@@ -29,4 +29,4 @@ def environment(folder: Path) -> dict[str, str]:
     built = subprocess.run(command, capture_output=True, text=True)
     if built.returncode != 0:
         raise RuntimeError(f"the backend cannot be compiled: {built.stderr}")
-    return {**os.environ, "LD_PRELOAD": str(library)}
+    return {**os.environ, "LD_PRELOAD": str(library), "OMP_NUM_THREADS": "1"}  # tensors are too small to share

@@ -1,11 +1,14 @@
 """What runs where there is a GPU, run on a pretended one; `tests/test_on_a_pretended_gpu.py` starts this in a process that can pretend."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
 from accelerate.state import AcceleratorState
 from safetensors.torch import load_file
 
+from benchmarks import tiers
 from tests.pretended_gpu.gpu import OnGpu, gpu
 from tests.scenes import photo_tar, shifted_pairs
 from tests.small_depth_networks import save_small_network
@@ -179,3 +182,12 @@ def test_fine_tuning_goes_on_exactly_and_no_step_waits_for_each_weight(folders, 
         assert waits["trainers.inpaint_loop.tune"] <= 2
     one, other = fine_tuning.weights(unbroken), fine_tuning.weights(resumed)
     assert all(torch.equal(weight, other[name]) for name, weight in one.items())
+
+
+def test_the_tiers_are_measured(tmp_path):
+    with gpu():
+        tiers.main(["--smoke", "--device", "cuda", "--json", str(tmp_path / "figures.json")])
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    assert figures["device"] == "pretended" and figures["dtype"] == "torch.bfloat16"
+    assert {row["micro_batch"] for row in figures["inpainting"][1:]} == {2}
+    assert all(row["peak_bytes"] is not None for row in figures["inpainting"] + figures["depth"])

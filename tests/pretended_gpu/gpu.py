@@ -173,6 +173,7 @@ SPECIAL: dict[Any, Callable[..., Any]] = {
     Tensor.tolist: _to_list,
     Tensor.numpy: _to_numpy,
     Tensor.__array__: _to_numpy,
+    Tensor.untyped_storage: lambda tensor: tensor.inner.untyped_storage(),
     Tensor.new_tensor: _new_tensor,
     Tensor.__deepcopy__: _deepcopy,
     Tensor.__getitem__: _get_item,
@@ -225,7 +226,7 @@ class _SafeOpen:
 
 
 PROPERTIES = SimpleNamespace(name="pretended", major=9, minor=0, total_memory=80 << 30, multi_processor_count=132)
-CUDA: dict[str, Callable[..., Any]] = {
+CUDA: dict[str, Any] = {
     "_lazy_init": lambda: None,
     "is_available": lambda: True,
     "is_initialized": lambda: True,
@@ -245,6 +246,7 @@ CUDA: dict[str, Callable[..., Any]] = {
     "get_device_properties": lambda device=None: PROPERTIES,
     "is_bf16_supported": lambda including_emulation=True: True,
     "manual_seed_all": lambda seed: None,
+    "default_generators": (torch.Generator(),),
 }
 
 
