@@ -7,6 +7,7 @@ from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 WARM_UP_STEPS = 10  # the average follows closely at first: its decay is at most (1 + step) / (WARM_UP_STEPS + step)
 
@@ -23,8 +24,8 @@ class WeightAverage:
 
     def update(self, network: nn.Module, step: int) -> None:
         decay = min(self._decay, (1 + step) / (WARM_UP_STEPS + step))
-        for mean, weight in zip(self.weights, network.parameters(), strict=True):
-            mean.lerp_(weight.detach(), 1 - decay)
+        blend = get_ema_multi_avg_fn(decay)  # all weights in a few kernels
+        blend(self.weights, [weight.detach() for weight in network.parameters()], None)
 
 
 @contextmanager
