@@ -18,6 +18,8 @@ from zsdata.synthesis.indices import flat_indices, indices_above
 SMALLEST_DISPARITY_PX = 0.01  # of the farthest point; not 0, which marks "no value" in most stereo data sets
 SHARPEN_EDGE_PX = 3.0  # Sobel magnitude above which a disparity belongs to neither side of an edge (the published threshold)
 NEAR_ROWS = 3  # within which nearly every edge value finds one that is none
+MOST_CHOICES = 1 << 20  # places that are weighed at once, for all edges together
+NO_SQUARE = 1 << 40  # farther than anything
 NOT_NEAR_PX = 45  # columns off that need no telling apart there; 14 * 45^2 is an int16
 
 _CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
@@ -200,30 +202,37 @@ def _nearest_values(edge: Tensor, frame: _Frame) -> Tensor:
     if far.shape[0]:
         none = frame.columns  # farther than any value of the row
         sides = [frame.table(edge, off, none) for off in columns_off(none)]
-        found[far] = _nearest_values_row_by_row(edge[far], sides, none, frame)
+        found[far] = _nearest_values_farther(edge[far], sides, none, frame)
     return found
 
 
-def _nearest_values_row_by_row(edge: Tensor, columns_off: Sequence[Tensor], none: int, frame: _Frame) -> Tensor:
-    """As `_nearest_values`, for some edges and at any distance; the edge itself where a map is edge all over."""
+def _nearest_values_farther(edge: Tensor, columns_off: Sequence[Tensor], none: int, frame: _Frame) -> Tensor:
+    """As `_nearest_values`, for some edges and at any distance; the edge itself where a map is edge all over. Rows are searched outwards,
+    ever more of them at once."""
     found, distance = edge.clone(), torch.full_like(edge, frame.rows**2 + frame.columns**2)
     row = torch.div(edge, frame.columns, rounding_mode="floor") % frame.rows
     pending = torch.arange(edge.shape[0], device=edge.device)
-    row_distance = 0
-    while pending.shape[0] and row_distance < frame.rows:
-        nearest, source = distance[pending], found[pending]
-        for row_step in (-row_distance, row_distance):
-            inside = (row[pending] + row_step >= 0) & (row[pending] + row_step < frame.rows)
-            there = torch.where(inside, edge[pending] + row_step * frame.columns, 0)  # at place 0 is none
-            for off, side in zip(columns_off, (-1, 1), strict=True):
-                step = off.index_select(0, there)
-                square = step * step + row_distance**2
-                better = (step < none) & (square < nearest)
-                nearest = torch.where(better, square, nearest)
-                source = torch.where(better, there + side * step, source)
-        distance[pending], found[pending] = nearest, source
-        row_distance += 1
-        pending = pending[nearest > row_distance**2]
+    begin = 0
+    while pending.shape[0] and begin < frame.rows:
+        at_once = max(1, min(max(begin, NEAR_ROWS + 1), MOST_CHOICES // (4 * pending.shape[0])))
+        end = min(begin + at_once, frame.rows)
+        which = torch.arange(2 * begin, 2 * end, device=edge.device).unsqueeze(1)  # of two rows equally far off the one above comes first
+        row_step = torch.div(which, 2, rounding_mode="floor") * (which % 2 * 2 - 1)
+        there = row[pending] + row_step
+        there = torch.where((there >= 0) & (there < frame.rows), edge[pending] + row_step * frame.columns, 0)  # at place 0 is none
+        steps = torch.stack([off.index_select(0, there.flatten()).view(there.shape) for off in columns_off], 1)
+        squares = (steps * steps + (row_step * row_step).unsqueeze(1)).masked_fill_(steps >= none, NO_SQUARE).flatten(0, 1)
+        order = torch.arange(squares.shape[0], device=edge.device).unsqueeze(1)
+        key = (squares * len(order) + order).amin(0)
+        square = torch.div(key, len(order), rounding_mode="floor")
+        choice = (key - square * len(order)).unsqueeze(0)
+        source = there.repeat_interleave(2, 0).gather(0, choice) + steps.flatten(0, 1).gather(0, choice) * (choice % 2 * 2 - 1)
+        nearest = distance[pending]
+        better = square < nearest
+        found[pending] = torch.where(better, source[0], found[pending])
+        distance[pending] = nearest = torch.where(better, square, nearest)
+        begin = end
+        pending = pending[nearest > begin**2]
     return found
 
 
