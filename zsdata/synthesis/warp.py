@@ -296,8 +296,11 @@ def _surfaces(disparity: Tensor, grid: _Grid, memory: _Memory) -> _Surfaces:
     cell = torch.sub(grid.cell, landing.copy_(whole), out=landing)
     nearest.zero_().scatter_reduce_(0, memory.take(count, torch.int64).copy_(cell), place, "amax")
 
+    # The column lies `fraction` right of x'(i) and `1 + whole(i) - disparity(i + 1)` left of x'(i + 1): both are exact, 1 + drop is not.
+    torch.sub(whole[:-1], disparity[1:], out=drop[:-1])
+    drop.view(-1, grid.width)[:, -1].zero_()
     fraction = torch.sub(disparity, whole, out=whole)
-    torch.div(fraction, drop.add_(1), out=share).mul_(same).clamp_(max=1)  # x'(i + 1) - x'(i) = 1 + drop
+    torch.div(fraction, drop.add_(1).add_(fraction), out=share).mul_(same)  # above 1 or NaN where the column is not the pixel's
     odd = torch.bitwise_and(cell, 1, out=place)
     landing.sub_(place.copy_(fraction.sub_(0.5).add_(odd, alpha=TIE_PX).ceil_()))
     breaks = flat_indices(simple.logical_not_())
@@ -346,7 +349,8 @@ def _special(disparity: Tensor, surfaces: _Surfaces, grid: _Grid) -> _Special:
 
     source = begins - inner.long()
     here, following = disparity.index_select(0, source), own[count:]  # the same where nothing joins them
-    share = (here - whole).div_((here - following).add_(1)).clamp_(0, 1).mul_(inner)
+    beyond = here - whole
+    share = beyond.div_((whole - following).add_(1).add_(beyond)).clamp_(0, 1).mul_(inner)
     return _Special(source, share, torch.lerp(here, following, share))
 
 
