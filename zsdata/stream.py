@@ -179,7 +179,7 @@ class ZeroStereoStream(IterableDataset):
             seed=seed,
             size=None if size is None else (int(size[0]), int(size[1])),
             schedule=self._schedule,
-            depth=depth,
+            depth=self._pinned_depth,
             preprocessing=preprocessing,
             depth_cache=_open_cache(depth_cache, depth_cache_bytes, depth, synthesis),
             disparity=disparity if disparity is not None else AdaptiveDisparity(),
@@ -190,7 +190,7 @@ class ZeroStereoStream(IterableDataset):
             shard_cache=None if shard_cache is None else ShardCache(shard_cache, shard_cache_bytes),
             reuse=reuse,
         )
-        if self._recipe.depth == "builtin":
+        if self._pinned_depth == "builtin":
             warn_once()  # here, and not in every worker
         self._worker = Worker(self._recipe)
         self._cpu_finisher: Finisher | None = None

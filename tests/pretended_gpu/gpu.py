@@ -31,12 +31,12 @@ class OnGpu(Tensor):
     """Says that it is on the GPU; `inner` has its numbers."""
 
     inner: Tensor
-    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
+    __torch_function__ = torch._C._disabled_torch_function_impl
 
     @staticmethod
     def __new__(cls, inner: Tensor) -> OnGpu:
         with torch.inference_mode(inner.is_inference()):
-            made = Tensor._make_wrapper_subclass(  # type: ignore[attr-defined]
+            made = Tensor._make_wrapper_subclass(
                 cls,
                 inner.size(),
                 strides=inner.stride(),
@@ -48,7 +48,7 @@ class OnGpu(Tensor):
             made.inner = inner.detach()
         return made
 
-    def __repr__(self) -> str:  # type: ignore[override]
+    def __repr__(self) -> str:
         return f"OnGpu({self.inner!r})"
 
     def __tensor_flatten__(self) -> tuple[list[str], None]:  # torch.nn.Module.to asks whether it is there
@@ -97,7 +97,7 @@ def _waiting() -> str:
         module = frame.f_globals.get("__name__", "")
         if module.split(".")[0] in OURS:
             return f"{module}.{frame.f_code.co_name}"
-        frame = frame.f_back  # type: ignore[assignment]
+        frame = frame.f_back
     return "elsewhere"
 
 

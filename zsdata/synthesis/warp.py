@@ -253,7 +253,7 @@ class _Surfaces(NamedTuple):
     Attributes:
         joined: float32 [N + 2], 1 where the pixel and its left neighbour are of one surface, else 0; 0 at N and N + 1.
         share: float32 [N], how far from the pixel (0) to its right neighbour (1) the point lies that lands on the first column at or right
-            of x'; 0 where they are two surfaces.
+            of x'; 0 where they are two surfaces; above 1 or NaN where that column is not the pixel's to cover.
         landing: int32 [N], the cell of round(x'), half to even.
         nearest: int32, all cells: the z-buffer, the place of the winning pixel, 0 where nothing lands.
         breaks: int64, ascending, from 0 to N: pixels whose left neighbour lies on another surface, or so far off that the column before
@@ -296,11 +296,12 @@ def _surfaces(disparity: Tensor, grid: _Grid, memory: _Memory) -> _Surfaces:
     cell = torch.sub(grid.cell, landing.copy_(whole), out=landing)
     nearest.zero_().scatter_reduce_(0, memory.take(count, torch.int64).copy_(cell), place, "amax")
 
-    # The column lies `fraction` right of x'(i) and `1 + whole(i) - disparity(i + 1)` left of x'(i + 1): both are exact, 1 + drop is not.
+    # The column lies `fraction` right of x'(i) and `1 + whole(i) - disparity(i + 1)` left of x'(i + 1). Their sum is 1 + drop, which
+    # would lose its digits where both are small.
     torch.sub(whole[:-1], disparity[1:], out=drop[:-1])
     drop.view(-1, grid.width)[:, -1].zero_()
     fraction = torch.sub(disparity, whole, out=whole)
-    torch.div(fraction, drop.add_(1).add_(fraction), out=share).mul_(same)  # above 1 or NaN where the column is not the pixel's
+    torch.div(fraction, drop.add_(1).add_(fraction), out=share).mul_(same)
     odd = torch.bitwise_and(cell, 1, out=place)
     landing.sub_(place.copy_(fraction.sub_(0.5).add_(odd, alpha=TIE_PX).ceil_()))
     breaks = flat_indices(simple.logical_not_())
