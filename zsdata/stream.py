@@ -34,7 +34,7 @@ from zsdata.synthesis.depth.builtin import warn_once
 from zsdata.synthesis.depth.cache import DepthCache
 from zsdata.synthesis.depth.identity import depth_identity, pinned
 from zsdata.synthesis.depth.options import STORED
-from zsdata.synthesis.depth.pretrained import PretrainedDepth, load_preprocessing
+from zsdata.synthesis.depth.pretrained import preprocessing_of
 from zsdata.synthesis.disparity import AdaptiveDisparity, UniformDisparity
 from zsdata.synthesis.inpaint import DiffusionNetwork, Inpainter, load_inpainter
 from zsdata.synthesis.micro_batch import WarmUp, say_warm_up
@@ -167,13 +167,9 @@ class ZeroStereoStream(IterableDataset):
             require_commercial(depth, "depth")
             require_commercial(self._inpaint, "inpaint")
         self._depth = depth
-        network, preprocessing = as_network(depth), None
-        if network is not None:
-            preprocessing = load_preprocessing(network)
-            depth = pinned(network)
-        elif isinstance(depth, PretrainedDepth):
-            preprocessing = depth.preprocessing
-        self._pinned_depth = depth
+        preprocessing = preprocessing_of(depth)
+        network = as_network(depth)
+        self._pinned_depth = depth = depth if network is None else pinned(network)
         synthesis = synthesis if synthesis is not None else SynthesisConfig()
         self._recipe = Recipe(
             seed=seed,

@@ -28,13 +28,12 @@ from zsdata.source.manifest import Manifest
 from zsdata.source.photo import PhotoFile
 from zsdata.sources import check_depth_maps
 from zsdata.stream import DEPTH_CACHE_BYTES
-from zsdata.synthesis.depth import DepthEstimator, as_network, load_depth
+from zsdata.synthesis.depth import DepthEstimator, load_depth
 from zsdata.synthesis.depth.builtin import warn_once
 from zsdata.synthesis.depth.cache import DepthCache, photo_digest
 from zsdata.synthesis.depth.identity import depth_identity
 from zsdata.synthesis.depth.options import STORED
-from zsdata.synthesis.depth.preprocessing import Preprocessing
-from zsdata.synthesis.depth.pretrained import load_preprocessing
+from zsdata.synthesis.depth.pretrained import preprocessing_of
 from zsdata.synthesis.disparity import AdaptiveDisparity
 from zsdata.synthesis.synthesizer import NEAREST, SynthesisConfig, estimate_depth, given_depth
 from zsdata.worker import MOST_SPARES, SHORTEST_SIDE_PX, single_thread, store_depth
@@ -113,11 +112,8 @@ class PhotoSource:
             logger.warning(
                 "%d faults in the tars of photos, the first: %s: %s", len(manifest.problems), first.key or first.shard, first.reason
             )
-        network = as_network(depth)
-        self._preprocessing: Preprocessing | None = getattr(depth, "preprocessing", None)
-        if network is not None:
-            self._preprocessing = load_preprocessing(network)  # what cannot be loaded fails here, and not in a worker
-        elif depth == STORED:
+        self._preprocessing = preprocessing_of(depth)  # what cannot be loaded fails here, and not in a worker
+        if depth == STORED:
             check_depth_maps("photos", manifest)
         elif depth == "builtin":
             warn_once()  # here, and not in every worker

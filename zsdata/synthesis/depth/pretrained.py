@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from zsdata.synthesis.depth import DepthEstimator, as_network
 from zsdata.synthesis.depth.model_folder import check_weights
 from zsdata.synthesis.depth.options import DepthNetwork
 from zsdata.synthesis.depth.preprocessing import Preprocessing, read_preprocessing
@@ -190,6 +191,18 @@ def _inverted(depth: Tensor) -> Tensor:
     lowest = pixels.topk(1 + math.ceil(NEAREST_SHARE * pixels.shape[1]), largest=False).values
     nearest = lowest[:, -1].clamp(min=SMALLEST_DEPTH_M)
     return 1 / depth.maximum(nearest.view(-1, 1, 1, 1))
+
+
+def preprocessing_of(depth: str | os.PathLike[str] | DepthNetwork | DepthEstimator) -> Preprocessing | None:
+    """How photos are prepared for the network behind a `depth` argument, named or loaded; None where there is none.
+
+    Raises:
+        ImportError, OSError, ValueError: as `PretrainedDepth`.
+    """
+    network = as_network(depth)
+    if network is not None:
+        return load_preprocessing(network)
+    return depth.preprocessing if isinstance(depth, PretrainedDepth) else None
 
 
 def load_preprocessing(network: DepthNetwork) -> Preprocessing:
