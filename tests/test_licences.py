@@ -1,6 +1,7 @@
 """Which model, at which revision, under which licence; and what commercial_safe refuses."""
 
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -9,12 +10,13 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
-from zsdata.licences import NonCommercialModel, model_record, model_records, require_commercial
+from zsdata.licences import NON_COMMERCIAL, NonCommercialModel, model_record, model_records, require_commercial
 from zsdata.synthesis.depth.options import DepthNetwork
 from zsdata.synthesis.inpaint.builtin import BuiltinInpainter
 from zsdata.synthesis.inpaint.options import DiffusionNetwork
 
 COMMIT = "0123456789" * 4
+LARGE = "Depth-Anything-V2-Large"
 
 
 @pytest.fixture(autouse=True)
@@ -71,6 +73,13 @@ def test_a_cached_pipeline_in_a_subfolder_is_found(hub_cache):
         ("---\nlicense: openrail++\n---\n", "openrail++"),
         ("---\nlicense: other\nlicense_name: sai-nc-community\n---\n", "sai-nc-community"),
         ("---\nlicense: other\n---\n", "other"),
+        ("---\nlicense: [other]\nlicense_name: mine\n---\n", "mine"),
+        ("---\nlicense: other\nlicense_link: https://github.com/facebookresearch/net/LICENSE\n---\n", "other"),
+        ("---\nlicense: other\nlicense_link: https://cc.org/by-nc/4.0\n---\n", "other (https://cc.org/by-nc/4.0)"),
+        ("---\nlicense: other\nlicense_name: mine\nlicense_link: LICENSE-cc-by-nc.md\n---\n", "mine (LICENSE-cc-by-nc.md)"),
+        ("---\nlicense: other\nbase_model: stabilityai/sd-turbo\n---\n", "sai-nc-community"),
+        ("---\nlicense: other\nbase_model: Intel/dpt-large\n---\n", "other"),
+        ("---\nbase_model: Intel/dpt-large\n---\n", "apache-2.0"),
         ("---\nlicense: [mit, apache-2.0]\n---\n", "mit, apache-2.0"),
         ("---\ntags: [depth]\n---\n", None),
         ("---\nlicense: [\n---\n", None),
@@ -91,12 +100,13 @@ def test_a_folder_without_a_card_is_known_by_its_name(tmp_path, hub_cache):
 
 
 @pytest.mark.parametrize("file", ["config.json", "model_index.json", "unet/config.json"])
-def test_a_renamed_copy_is_known_by_what_it_was_loaded_from(tmp_path, file):
+@pytest.mark.parametrize("origin", ["stabilityai/sd-turbo", "./sd-turbo/unet", "/hub/models--stabilityai--sd-turbo/snapshots/01/unet"])
+def test_a_renamed_copy_is_known_by_what_it_was_loaded_from(tmp_path, file, origin):
     path = tmp_path / "mine" / file
     path.parent.mkdir(parents=True)
-    path.write_text('{"_name_or_path": "stabilityai/sd-turbo"}')
+    path.write_text(json.dumps({"_name_or_path": origin}))
     assert model_record(str(tmp_path / "mine"))["licence"] == "sai-nc-community"
-    with pytest.raises(NonCommercialModel, match="sai-nc-community"):
+    with pytest.raises(NonCommercialModel, match=rf"sai-nc-community \(by its {path.name} it is or comes from stabilityai/sd-turbo\)"):
         require_commercial(DiffusionNetwork(str(tmp_path), subfolder="mine"), "inpaint")
     for text in ('{"_name_or_path": 3}', "[]", "no json"):
         path.write_text(text)
@@ -109,6 +119,137 @@ def test_a_copy_in_a_subfolder_is_known_by_its_name(tmp_path, name):
     for network in (DiffusionNetwork(str(tmp_path), subfolder=name), DiffusionNetwork(str(tmp_path / name))):
         with pytest.raises(NonCommercialModel, match="sai-nc-community"):
             require_commercial(network, "inpaint")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        LARGE,
+        LARGE.upper(),
+        f"{LARGE}-hf-local",
+        f"{LARGE}.bak",
+        f"{LARGE}-hf/snapshot",
+        f"{LARGE}-hf/snapshots/0123456789",
+        f"depth-anything/{LARGE}/fp16",
+        f"depth-anything--{LARGE}-hf/abc",
+        f"depth-anything_{LARGE}-hf",
+        f"a-mirror--{LARGE}-hf",
+        f"models--depth-anything--{LARGE}-hf/snapshots/0123456789/deeper/down",
+    ],
+)
+def test_a_copy_is_known_by_its_name_or_that_of_a_folder_around_it(tmp_path, name):
+    (tmp_path / name).mkdir(parents=True)
+    with pytest.raises(NonCommercialModel, match=rf"by its folder's name it is or comes from depth-anything/{LARGE}-hf\)"):
+        require_commercial(str(tmp_path / name), "depth")
+    (tmp_path / "link").symlink_to(tmp_path / name)
+    with pytest.raises(NonCommercialModel, match="cc-by-nc"):
+        require_commercial(str(tmp_path / "link"), "depth")
+
+
+def test_a_link_is_known_by_its_own_name_too(tmp_path):
+    (tmp_path / "store").mkdir()
+    (tmp_path / LARGE).symlink_to(tmp_path / "store")
+    with pytest.raises(NonCommercialModel, match="cc-by-nc"):
+        require_commercial(str(tmp_path / LARGE), "depth")
+
+
+@pytest.mark.parametrize(
+    ("name", "licence"),
+    [
+        ("Depth-Anything-V2-Small-hf", "apache-2.0"),
+        ("depth-anything--Depth-Anything-V2-Small-hf", "apache-2.0"),
+        ("depth-anything-large-hf", "apache-2.0"),
+        (f"{LARGE}-hf/Depth-Anything-V2-Small-hf", "apache-2.0"),
+        ("Depth-Anything-V2-Small-hf-local", None),
+        ("Depth-Anything-V2-Small-hf/mine", None),
+        ("Depth-Anything-V2", None),
+        (f"{LARGE}st", None),
+        ("sd-turbo-experiments/my-depth", None),
+        ("sd-turbo/work/runs/my-depth", None),
+        ("turbo", None),
+        ("models--somebody--sd-turbo/snapshots/0123456789", None),
+    ],
+)
+def test_other_folders_are_not_taken_for_copies(tmp_path, name, licence):
+    (tmp_path / name).mkdir(parents=True)
+    require_commercial(str(tmp_path / name), "depth")
+    assert model_record(str(tmp_path / name))["licence"] == licence
+
+
+@pytest.mark.parametrize("licence", ["", "license: other\n", "license: apache-2.0\n"])
+@pytest.mark.parametrize(
+    "base",
+    [
+        f"depth-anything/{LARGE}-hf",
+        f"depth-anything/{LARGE}",
+        f"[Intel/dpt-large, depth-anything/{LARGE}-hf]",
+        f"https://huggingface.co/depth-anything/{LARGE}-hf",
+    ],
+)
+def test_a_model_is_known_by_the_base_model_of_its_card(tmp_path, hub_cache, licence, base):
+    card = f"---\n{licence}base_model: {base}\n---\n"
+    cached(hub_cache, "somebody/depth", card=card)
+    for name in (folder(tmp_path / "mine", card), "somebody/depth"):
+        with pytest.raises(
+            NonCommercialModel, match=rf"under cc-by-nc-4\.0 \(by its model card it is or comes from depth-anything/{LARGE}-hf\)"
+        ):
+            require_commercial(name, "depth")
+
+
+@pytest.mark.parametrize(
+    "link", ["https://creativecommons.org/licenses/by-nc/4.0/", "LICENSE-cc-by-nc-4.0", "https://host/non-commercial.txt"]
+)
+@pytest.mark.parametrize("licence", ["", "license: other\n", "license: other\nlicense_name: mine\n"])
+def test_a_link_to_a_non_commercial_licence_is_read(tmp_path, licence, link):
+    with pytest.raises(NonCommercialModel, match=rf"under (other|mine) \({link}\), which allows no commercial use"):
+        require_commercial(folder(tmp_path / "mine", f"---\n{licence}license_link: {link}\n---\n"), "depth")
+
+
+def test_every_card_of_a_pipeline_is_read(tmp_path):
+    name = folder(tmp_path / "mine", "---\nlicense: mit\n---\n")
+    folder(tmp_path / "mine" / "turbo", "---\nlicense: cc-by-nc-4.0\n---\n")
+    with pytest.raises(NonCommercialModel, match="cc-by-nc"):
+        require_commercial(DiffusionNetwork(name, subfolder="turbo"), "inpaint")
+    (tmp_path / "mine" / "README.md").write_text("---\nlicense: other\n---\n")
+    assert model_record(name, subfolder="turbo")["licence"] == "cc-by-nc-4.0"
+
+
+@pytest.mark.parametrize(
+    ("licence", "refused"),
+    [
+        *((name, True) for name in ("cc-by-nc-4.0", "cc-by-nc-sa-4.0", "CC BY-NC 4.0", "cc-by-nc, mit", "apple-amlr", "apple-amlr, mit")),
+        *((name, True) for name in ("sai-nc-community", "sai_nc_community", "stabilityai-nc-research-community", "intel-research")),
+        *((name, True) for name in ("flux-1-dev-non-commercial-license", "polyform-noncommercial", "Non Commercial", "non_commercial")),
+        *((name, False) for name in ("openrail++", "creativeml-openrail-m", "apache-2.0", "mit", "bsd-3-clause", "llama3", "gemma")),
+        *((name, False) for name in ("ncsa", "apple-ascl", "cc-by-4.0", "commercial", "Example Inc")),
+    ],
+)
+def test_a_non_commercial_licence_is_known_by_its_name(licence, refused):
+    assert bool(NON_COMMERCIAL.search(licence)) == refused
+
+
+def test_a_model_of_unknown_licence_is_warned_of_once(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr("zsdata.licences._told", set())
+    other = folder(tmp_path / "other", "---\nlicense: other\n---\n")
+    named = folder(tmp_path / "named", "---\nlicense: other\nlicense_name: mine\n---\n")
+    with caplog.at_level(logging.WARNING, "zsdata"):
+        for _ in range(2):
+            for step in ("somebody/depth", other, "stored", named, "Intel/dpt-large", "builtin", _estimator):
+                require_commercial(step, "depth")
+        require_commercial(DiffusionNetwork("Windsrain/ZeroStereo", autoencoder="somebody/vae"), "inpaint")
+    assert [record.getMessage().partition(",")[0] for record in caplog.records] == [
+        'the licence of depth="somebody/depth" is not known',
+        f'the licence of depth="{other}" is not known',
+        'the licence of depth="stored" is not known',
+        'the licence of inpaint="somebody/vae" is not known',
+    ]
+
+
+def test_a_folder_named_as_a_built_in_step_says_nothing_of_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("builtin", "stored"):
+        folder(tmp_path / name, "---\nlicense: cc-by-nc-4.0\nbase_model: stabilityai/sd-turbo\n---\n")
+        require_commercial(name, "depth")
 
 
 def test_a_card_of_the_hub_is_looked_at_before_the_model_is_loaded(hub_cache, tmp_path, monkeypatch):
@@ -159,7 +300,7 @@ def test_every_model_of_a_step_is_recorded():
     assert model_records(_estimator) == [{"id": f"{__name__}._estimator", "revision": None, "licence": None}]
 
     class Loaded:
-        network = DepthNetwork("Intel/dpt-large")
+        pinned = DepthNetwork("Intel/dpt-large")
 
     assert model_records(Loaded())[0]["id"] == "Intel/dpt-large"
     json.dumps(model_records(pipeline))

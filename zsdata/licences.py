@@ -6,6 +6,7 @@ What is said here is what the model cards say, as far as they are at hand: a rec
 from __future__ import annotations
 
 import json
+import logging
 import os
 import re
 from collections.abc import Iterator
@@ -18,6 +19,8 @@ from huggingface_hub.errors import HfHubHTTPError
 
 from zsdata.synthesis.depth.options import STORED, DepthNetwork
 from zsdata.synthesis.inpaint.options import DiffusionNetwork
+
+logger = logging.getLogger("zsdata")
 
 CARD = "README.md"
 OWN_LICENCE = "apache-2.0"
@@ -50,12 +53,17 @@ LICENCES = {
     "stabilityai/sdxl-turbo": "sai-nc-community",
 }
 KNOWN = {name.lower(): licence for name, licence in LICENCES.items()}
-NON_COMMERCIAL = re.compile(r"(^|[-_ ])nc([-_ ]|$)|non-?commercial|research|(^|-)amlr($|-)", re.IGNORECASE)
+NON_COMMERCIAL = re.compile(r"(?<![a-z0-9])(nc|amlr)(?![a-z])|non[-_ ]?commercial|research", re.IGNORECASE)
+NON_COMMERCIAL_LINK = re.compile(r"by-nc(?![a-z])|non[-_]?commercial", re.IGNORECASE)  # not "research": it may be who wrote the licence
+SILENT = ("", "other", "unknown")  # what a card says where it does not say the licence
 ALTERNATIVES = {
     "depth": '"depth-anything/Depth-Anything-V2-Small-hf" (apache-2.0), "Intel/zoedepth-nyu-kitti" (mit) or "builtin"',
     "inpaint": '"Windsrain/ZeroStereo" with subfolder "StereoGen" (mit), "sd2-community/stable-diffusion-2-inpainting" (openrail++) '
     'or "builtin"',
 }
+
+
+_told: set[tuple[str, str | None, str]] = set()  # models that were warned of, in this process
 
 
 class NonCommercialModel(ValueError):
@@ -72,18 +80,22 @@ def model_record(name: str, revision: str | None = None, subfolder: str = "") ->
         subfolder: where in it the model lies.
 
     Returns:
-        `licence` is what the model card (README.md of the folder, or in the Hub cache) says; without a card what is known of that id, of a
-        folder named as one, or of a model that the folder's configuration says it was made from; None where nothing is.
+        `licence` is what the model card (README.md of the folder, or in the Hub cache) says; where it says nothing what is known of that
+        id, of a folder named as one, or of a model that the card or a configuration says it was made from, a non-commercial licence before
+        others; None where nothing is. A card's "other" stays unless what is known is non-commercial.
     """
     if name in BUILT_IN:
         return {"id": name, "revision": None, "licence": OWN_LICENCE}
     if name == STORED:
         return {"id": name, "revision": None, "licence": None}
-    folder = Path(name) if os.path.isdir(name) else _snapshot(name, revision, subfolder)
-    licence = None if folder is None else _card_licence(folder, folder / subfolder)
+    folder = _folder(name, revision, subfolder)
+    licence = min(_card_licences(folder, subfolder), key=_silent, default=None)
+    if _silent(licence):
+        known = [LICENCES[model] for model, _ in _known_models(name, folder, subfolder)]
+        licence = next(filter(NON_COMMERCIAL.search, known), licence or next(iter(known), None))
     if folder is not None and not os.path.isdir(name):
         revision = folder.name
-    return {"id": name, "revision": revision, "licence": licence or next(_known_licences(name, subfolder), None)}
+    return {"id": name, "revision": revision, "licence": licence}
 
 
 def model_records(step: Any) -> list[dict[str, str | None]]:
@@ -93,7 +105,7 @@ def model_records(step: Any) -> list[dict[str, str | None]]:
         step: a name or path, a DepthNetwork, a DiffusionNetwork, or a callable; of one that `load_depth` or `load_inpainter` made, the
             network's.
     """
-    network = getattr(step, "network", step)
+    network = getattr(step, "pinned", step)
     if isinstance(network, DepthNetwork | DiffusionNetwork):
         return [model_record(*model) for model in _models(network)]
     if isinstance(network, str | os.PathLike):
@@ -105,11 +117,11 @@ def model_records(step: Any) -> list[dict[str, str | None]]:
 
 def _models(step: Any) -> list[tuple[str, str | None, str]]:
     """(name, revision, subfolder) of every model behind a name, a path, a DepthNetwork or a DiffusionNetwork."""
-    network = getattr(step, "network", step)
+    network = getattr(step, "pinned", step)
     if isinstance(network, DepthNetwork):
         return [(network.name, network.revision, "")]
     if isinstance(network, DiffusionNetwork):
-        other = [] if network.autoencoder is None else [(network.autoencoder, None, "")]
+        other = [] if network.autoencoder is None else [(network.autoencoder, network.autoencoder_revision, "")]
         return [(network.name, network.revision, network.subfolder), *other]
     return [(os.fspath(network), None, "")] if isinstance(network, str | os.PathLike) else []
 
@@ -131,7 +143,7 @@ def fetch_cards(*steps: Any) -> None:
 
 
 def require_commercial(step: Any, argument: str) -> None:
-    """Refuses models that are known to be for non-commercial use alone. A model of which nothing is known passes.
+    """Refuses models that are known to be for non-commercial use alone. One of which no licence is known passes, with a warning.
 
     Args:
         step: as `model_records` takes it.
@@ -140,56 +152,119 @@ def require_commercial(step: Any, argument: str) -> None:
     Raises:
         NonCommercialModel: it names the model, its licence and alternatives.
     """
-    for name, revision, subfolder in _models(step):
-        said = [model_record(name, revision, subfolder)["licence"], *_known_licences(name, subfolder)]
-        refused = next((licence for licence in said if licence is not None and NON_COMMERCIAL.search(licence)), None)
-        if refused is not None:
-            raise NonCommercialModel(
-                f'{argument}="{name}" is under {refused}, which allows no commercial use, and commercial_safe is set. '
-                f"Take {ALTERNATIVES[argument]}, or leave commercial_safe out"
+    for model in _models(step):
+        name, *_ = model
+        for licence, reason in _licences(*model):
+            if NON_COMMERCIAL.search(licence):
+                raise NonCommercialModel(
+                    f'{argument}="{name}" is under {licence}{reason}, which allows no commercial use, and commercial_safe is set. '
+                    f"Take {ALTERNATIVES[argument]}, or leave commercial_safe out"
+                )
+        if _silent(model_record(*model)["licence"]) and model not in _told:
+            _told.add(model)
+            logger.warning(
+                'the licence of %s="%s" is not known, so commercial_safe cannot judge it; look it up where the model comes from',
+                argument,
+                name,
             )
 
 
-def _known_licences(name: str, subfolder: str) -> Iterator[str]:
-    """Of a Hub id; of a folder what its name, its place in the Hub's cache and its configurations say that it is, or was made from."""
-    if not os.path.isdir(name):
-        yield from filter(None, [KNOWN.get(name.lower())])
+def _licences(name: str, revision: str | None, subfolder: str) -> Iterator[tuple[str, str]]:
+    """(licence, why it is thought to be that one) for all that is said of a model: by its cards, then by what it is or comes from."""
+    if name in (*BUILT_IN, STORED):
         return
-    parts = Path(os.path.realpath(name)).parts
-    cached = [part.removeprefix("models--").replace("--", "/") for part in parts if part.startswith("models--")]
-    origins = [KNOWN.get(origin.lower()) for origin in (*cached[-1:], *_origins(Path(name, subfolder)))]
-    folders = {part.lower().replace("_", "-") for part in (*parts[-1:], *Path(subfolder).parts)} if not cached else set()
-    yield from filter(None, origins)
-    yield from (licence for known, licence in KNOWN.items() if known.rpartition("/")[2] in folders)
+    folder = _folder(name, revision, subfolder)
+    yield from ((licence, "") for licence in _card_licences(folder, subfolder))
+    for model, evidence in _known_models(name, folder, subfolder):
+        yield LICENCES[model], f" (by its {evidence} it is or comes from {model})" if evidence else ""
 
 
-def _origins(folder: Path) -> Iterator[str]:
-    """What the configurations in a folder name as the models that they were loaded from."""
-    for path in (folder / "config.json", folder / "model_index.json", *sorted(folder.glob("*/config.json"))):
+def _known_models(name: str, folder: Path | None, subfolder: str) -> Iterator[tuple[str, str]]:
+    """(known model, what says so): a Hub id itself, and what its folders' names, cards and configurations say that it is or comes from."""
+    if os.path.isdir(name):
+        paths = [(path, "folder's name") for path in dict.fromkeys((os.path.abspath(name), os.path.realpath(name)))]
+    else:
+        paths = []
+        yield from ((known, "") for known in LICENCES if _plain(known) == _plain(name))
+    paths += [(part, "subfolder's name") for part in Path(subfolder).parts]
+    paths += [] if folder is None else _origins(folder, subfolder)
+    yield from ((known, evidence) for path, evidence in paths if (known := _named_after(path)) is not None)
+
+
+def _named_after(path: str) -> str | None:
+    """The known model that a Hub id or path is named as: by its place in the Hub's cache, or by its last parts, with or without the owner.
+
+    A name that only begins as a known one ("sd-turbo-local"), or a folder around it ("sd-turbo/snapshots/abc"), can forbid but not allow.
+    """
+    parts = Path(path).parts
+    cached = [_plain(part.removeprefix("models--")) for part in parts if part.startswith("models--")]
+    if cached:
+        return next((known for known in LICENCES if _plain(known) == cached[-1]), None)
+    names = {_plain(form): known for known in LICENCES for form in (known, known.rpartition("/")[2])}
+    for above, part in enumerate(reversed(parts[-3:])):  # further up they are projects and disks, not models
+        said = (_plain(part), _plain(part.rpartition("--")[2]))
+        found = [name for name in names if name in said or (above == 0 and any(form.startswith(f"{name}-") for form in said))]
+        if found:
+            name = max(found, key=len)
+            sure = above == 0 and name in said
+            return names[name] if sure or NON_COMMERCIAL.search(LICENCES[names[name]]) else None
+    return None
+
+
+def _plain(name: str) -> str:
+    """A model's name as names are compared: "Depth_Anything-V2-Large-hf" and "depth-anything-v2-large" are one."""
+    return re.sub("[^a-z0-9]+", "-", name.lower()).strip("-").removesuffix("-hf")
+
+
+def _origins(folder: Path, subfolder: str) -> Iterator[tuple[str, str]]:
+    """What the cards and configurations in a folder name as the models that these were made or loaded from, and which of them does."""
+    for card in _cards(folder, subfolder):
+        yield from ((base, "model card") for base in _texts(card.get("base_model")))
+    inner = folder / subfolder
+    for path in (inner / "config.json", inner / "model_index.json", *sorted(inner.glob("*/config.json"))):
         try:
             config = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError):  # not there, or not JSON: loading the model says so
             continue
         if isinstance(config, dict) and isinstance(config.get("_name_or_path"), str):
-            yield config["_name_or_path"]
+            yield config["_name_or_path"], path.name
 
 
-def _card_licence(*folders: Path) -> str | None:
-    """Of the first of the folders that has a model card with a licence."""
-    for folder in folders:
-        card = folder / CARD
+def _card_licences(folder: Path | None, subfolder: str) -> Iterator[str]:
+    """Of each model card that names a licence; with its link where only that says that it is non-commercial."""
+    for card in _cards(folder, subfolder):
+        licence = ", ".join(_texts(card.get("license")))
+        if _silent(licence):
+            licence = ", ".join(_texts(card.get("license_name"))) or licence
+            links = [f"({link})" for link in _texts(card.get("license_link")) if NON_COMMERCIAL_LINK.search(link)]
+            licence = " ".join([licence or "other", *links]) if links else licence
+        if licence:
+            yield licence
+
+
+def _cards(folder: Path | None, subfolder: str) -> Iterator[dict[str, Any]]:
+    """What the model cards say that lie in a folder and in its subfolder."""
+    for place in () if folder is None else dict.fromkeys((folder, folder / subfolder)):
+        card = place / CARD
         if not card.is_file():
             continue
         try:
-            said = metadata_load(card) or {}
+            yield metadata_load(card) or {}
         except (ValueError, yaml.YAMLError):  # a card that cannot be read says nothing
             continue
-        licence = said.get("license")
-        if licence == "other":
-            licence = said.get("license_name", licence)
-        if licence:
-            return ", ".join(map(str, licence)) if isinstance(licence, list) else str(licence)
-    return None
+
+
+def _texts(entry: Any) -> list[str]:
+    """An entry of a card, which may be missing, one value or several."""
+    return [str(value) for value in (entry if isinstance(entry, list) else [entry]) if value]
+
+
+def _silent(licence: str | None) -> bool:
+    return licence is None or licence.lower() in SILENT
+
+
+def _folder(name: str, revision: str | None, subfolder: str) -> Path | None:
+    return Path(name) if os.path.isdir(name) else _snapshot(name, revision, subfolder)
 
 
 def _snapshot(name: str, revision: str | None, subfolder: str) -> Path | None:
