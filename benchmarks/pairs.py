@@ -51,8 +51,8 @@ from zsdata.progress import Progress
 from zsdata.source.pack import pack
 from zsdata.source.photo import BadPhoto, probe_size
 from zsdata.synthesis.depth.builtin import BuiltinDepthWarning
+from zsdata.synthesis.depth.maps import NEAREST
 from zsdata.synthesis.disparity import SMALLEST_DISPARITY_PX, sharpen_disparity
-from zsdata.synthesis.synthesizer import NEAREST
 from zsdata.synthesis.view import View, view_map
 from zsdata.worker import single_thread
 

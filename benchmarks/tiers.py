@@ -236,7 +236,7 @@ def measure_depth(folder: Path, device: torch.device, matmul: float, options: ar
         report = depth.warm_up(photo_size)
         prepare, _ = timed(lambda depth=depth: depth.prepare(photo), torch.device("cpu"), options.repeats)
         inputs = [depth.prepare(photo).to(device)] * options.micro_batch
-        work = lambda depth=depth, inputs=inputs: depth.predict_mirrored(inputs, [photo_size] * len(inputs))  # noqa: E731
+        work = lambda depth=depth, inputs=inputs: list(depth.predict_mirrored(inputs, [photo_size] * len(inputs)))  # noqa: E731
         seconds, _ = timed(work, device, options.repeats)
         photos_per_second = len(inputs) / seconds
         row = {"network": name, "photos_per_second": photos_per_second, "prepare_ms": 1e3 * prepare, "peak_bytes": report.peak_bytes}

@@ -190,13 +190,14 @@ if hasattr(hf, "Tipsv2DptConfig"):
     NETWORKS["tipsv2"] = (tipsv2, "Tipsv2DptImageProcessor", {"size": SQUARE_70, "resample": 2, "do_normalize": False})
 if hasattr(hf, "CHMv2Config"):
     NETWORKS["chmv2"] = (chmv2, "CHMv2ImageProcessor", {})
+REFUSED = dict[str, tuple[Callable[[], Any], str, dict[str, Any]]]()
 if hasattr(hf, "PromptDepthAnythingConfig"):  # since transformers 4.50
-    NETWORKS["prompt_depth_anything"] = (prompt_depth_anything, "PromptDepthAnythingImageProcessor", {"size": SQUARE_70, **PATCHES})
+    REFUSED["prompt_depth_anything"] = (prompt_depth_anything, "PromptDepthAnythingImageProcessor", {"size": SQUARE_70, **PATCHES})
 
 
 def save_small_network(kind: str, folder: Path, seed: int = 0) -> Path:
-    """Writes one of NETWORKS to `folder`. Its weights let signals through: what it predicts varies over the image."""
-    build, processor, options = NETWORKS[kind]
+    """Writes one of NETWORKS or REFUSED to `folder`. Its weights let signals through: what it predicts varies over the image."""
+    build, processor, options = {**NETWORKS, **REFUSED}[kind]
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         network = build()

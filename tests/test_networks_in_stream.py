@@ -1,14 +1,14 @@
 import json
-import os
 import shutil
-import subprocess
-import sys
+from dataclasses import replace
 
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from tests.hub_cache import COMMITS, run_offline, save_to_hub
 from tests.scenes import grey_fill, layered_depth, photo, photo_tar, png, write_tar
+from tests.small_pipeline import save_small_pipeline
 from zsdata import QualityGate, ZeroStereoStream, load_depth
 from zsdata.licences import NonCommercialModel
 from zsdata.synthesis.depth import DepthNetwork
@@ -124,16 +124,12 @@ def test_a_network_that_is_nowhere_is_an_error_at_once_and_in_words(tar, tmp_pat
 
 
 def test_a_network_of_the_hub_stays_the_one_that_it_was_when_the_stream_was_made(folder, tar, tmp_path):
-    repository, commits = tmp_path / "hub" / "models--somebody--depth", ["a" * 40, "b" * 40]
-    for seed, commit in enumerate(commits):
-        small.save_small_network("depth_anything", repository / "snapshots" / commit, seed=seed)
-    (repository / "refs").mkdir()
-    (repository / "refs" / "main").write_text(commits[0])
+    main = save_to_hub(tmp_path, "somebody/depth", lambda number, path: small.save_small_network("depth_anything", path, seed=number))
     program = f"""
 import json, sys
 from pathlib import Path
 from tests.scenes import grey_fill
-from zsdata import ZeroStereoStream
+from zsdata import DepthNetwork, ZeroStereoStream
 
 def stream(depth, **options):
     return ZeroStereoStream({str(tar)!r}, size={SIZE}, depth=depth, inpaint=grey_fill, **options)
@@ -143,16 +139,79 @@ def disparities(stream):
         return [batch.disparity.tolist() for batch in loader]
 
 first, cached = stream("somebody/depth"), stream("somebody/depth", depth_cache={str(tmp_path / "cache")!r})
-Path({str(repository / "refs" / "main")!r}).write_text({commits[1]!r})
+Path({str(main)!r}).write_text({COMMITS[1]!r})
 second = stream("somebody/depth")
-old, new = (disparities(stream({str(repository / "snapshots")!r} + "/" + commit)) for commit in {commits})
+old, new = (disparities(stream({str(main.parents[1] / "snapshots")!r} + "/" + commit)) for commit in {COMMITS})
 assert disparities(first) == disparities(cached) == old != new == disparities(second)
-assert [one.provenance()["depth"][0]["revision"] for one in (first, second)] == {commits}
-second.load_state_dict(first.state_dict())
+assert [one.provenance()["depth"][0]["revision"] for one in (first, second)] == {COMMITS}
+try:
+    second.load_state_dict(first.state_dict())
+    raise SystemExit("a state of other labels was taken")
+except ValueError as error:
+    assert "somebody/depth@{COMMITS[0]}" in str(error) and "somebody/depth@{COMMITS[1]}" in str(error), error
+same = stream(DepthNetwork("somebody/depth", revision={COMMITS[0]!r}))
+same.load_state_dict(first.state_dict())
 """
-    environment = {**os.environ, "HF_HOME": str(tmp_path), "HF_HUB_CACHE": str(tmp_path / "hub"), "HF_HUB_OFFLINE": "1"}
-    result = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=200)
-    assert result.returncode == 0, result.stderr
+    run_offline(program, tmp_path)
+
+
+def test_a_pipeline_of_the_hub_stays_the_one_that_it_was_when_the_stream_was_made(tar, tmp_path):
+    pytest.importorskip("diffusers")
+
+    def save(number, path):
+        weights = save_small_pipeline(path / "inner") / "unet" / "diffusion_pytorch_model.safetensors"
+        save_file({name: weight * (1 + number) for name, weight in load_file(weights).items()}, weights)
+
+    main = save_to_hub(tmp_path, "somebody/pipelines", save)
+    program = f"""
+from pathlib import Path
+import torch
+from tests.scenes import layered_depth
+from zsdata import DiffusionNetwork, ZeroStereoStream, load_inpainter
+
+def stream(**options):
+    network = DiffusionNetwork("somebody/pipelines", subfolder="inner", steps=1, **options)
+    return ZeroStereoStream({str(tar)!r}, size={SIZE}, depth=layered_depth, inpaint=network, epoch_size=2)
+
+first = stream()
+Path({str(main)!r}).write_text({COMMITS[1]!r})
+second, again = stream(), stream(revision={COMMITS[0]!r})
+made = [next(iter(one)).right for one in (first, second, again)]
+assert torch.equal(made[0], made[2]) and not torch.equal(made[0], made[1])
+assert [one.provenance()["inpaint"][0]["revision"] for one in (first, second, again)] == {[*COMMITS, COMMITS[0]]}
+again.load_state_dict(first.state_dict())
+loaded = load_inpainter("somebody/pipelines", subfolder="inner", steps=1)
+assert loaded.network.revision is None and loaded.pinned.revision == {COMMITS[1]!r}
+try:
+    second.load_state_dict(first.state_dict())
+    raise SystemExit("a state of other pictures was taken")
+except ValueError as error:
+    assert "'inpaint': 'somebody/pipelines@{COMMITS[0]}'" in str(error), error
+"""
+    run_offline(program, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("inpaint", "message"),
+    [
+        ("buildin", '"buildin" is neither a folder nor a Hub id'),
+        ("/no/such", '"/no/such" is neither a folder nor a Hub id'),
+        ("FOLDER", "is no inpainting pipeline: it lacks unet/, vae/"),
+        (DiffusionNetwork("PIPELINE", scheduler="fastest"), 'scheduler is one of .*; got "fastest"'),
+        (DiffusionNetwork("PIPELINE", autoencoder="/no/such"), '"/no/such" is neither a folder nor a Hub id'),
+        (DiffusionNetwork("PIPELINE", revision="v1"), 'is a folder, which has no revisions; got revision="v1"'),
+    ],
+    ids=str,
+)
+def test_an_inpainter_that_cannot_work_is_refused_before_any_photo_is_made(tar, tmp_path, inpaint, message):
+    pytest.importorskip("diffusers")
+    pipeline = save_small_pipeline(tmp_path / "pipeline")
+    for part in ("unet", "vae", "text_encoder"):
+        (next((pipeline / part).glob("*.safetensors"))).write_bytes(b"no weights are read")
+    if isinstance(inpaint, DiffusionNetwork):
+        inpaint = replace(inpaint, name=str(pipeline))
+    with pytest.raises((ValueError, OSError), match=message):
+        ZeroStereoStream(tar, size=SIZE, depth=layered_depth, inpaint=tmp_path if inpaint == "FOLDER" else inpaint)
 
 
 def test_auto_keeps_depth_in_the_workers_where_the_loader_has_no_gpu(folder, tar):
@@ -211,6 +270,30 @@ def test_networks_are_warmed_up_for_the_pairs_that_a_batch_has_and_say_so(tar, c
     assert capsys.readouterr().err == ""  # once for all ranks
 
 
+@pytest.mark.parametrize("size", [SIZE, None])
+def test_networks_that_see_whole_photos_are_warmed_up_for_the_largest_of_the_first_ones(tmp_path, capsys, size):
+    """On a pretended device, as above. A photo that cannot be used is passed over."""
+
+    class Network:
+        def __init__(self, what):
+            self.what = what
+
+        def warm_up(self, size, most):
+            return WarmUp(f"{self.what} of {most} at {size}", most, 2 * GIB, GIB, 0.5)
+
+        def __call__(self, images, *_):
+            return images
+
+    photos = {f"{i}.png": png(photo(i, *shape)) for i, shape in enumerate([(70, 100), (120, 160), (90, 130)])}
+    tar = write_tar(tmp_path / "photos.tar", {**photos, "3.png": b"not an image"})
+    stream = ZeroStereoStream(tar, size=size, depth=Network("depth"), inpaint=Network("inpainting"), depth_placement="device")
+    stream.loader(4 if size else 1, device="meta")
+    inpainting, depth, together = capsys.readouterr().err.splitlines()
+    pairs, seen = (4, (64, 128)) if size else (1, (120, 192))  # of what the crop, or the photo, is filled from
+    assert f"inpainting of {pairs} at {seen}:" in inpainting and f"depth of {pairs} at (120, 160):" in depth
+    assert together.endswith("the stream takes at most 3.00 GiB beside training, for photos of up to 120x160")
+
+
 def test_loaded_networks_count_by_their_options(folder, tar):
     def configuration(**options):
         return ZeroStereoStream(tar, size=SIZE, depth=load_depth(folder, **options)).provenance()["configuration"]
@@ -218,15 +301,16 @@ def test_loaded_networks_count_by_their_options(folder, tar):
     assert configuration() == configuration(micro_batch=2) != configuration(resolution=42)
 
 
-def test_provenance_names_the_models_with_their_licences(folder, tar):
+def test_provenance_names_the_models_with_their_licences(folder, tar, tmp_path):
+    pytest.importorskip("diffusers")
     (folder / "README.md").write_text("---\nlicense: apache-2.0\n---\n# a card\n")
-    stream = ZeroStereoStream(
-        tar, size=SIZE, depth=folder, inpaint=DiffusionNetwork("Windsrain/ZeroStereo", subfolder="StereoGen", steps=4)
-    )
-    record = stream.provenance()
+    save_small_pipeline(tmp_path / "ZeroStereo" / "StereoGen")
+    (tmp_path / "ZeroStereo" / "StereoGen" / "README.md").unlink()
+    network = DiffusionNetwork(str(tmp_path / "ZeroStereo"), subfolder="StereoGen", steps=4)
+    record = ZeroStereoStream(tar, size=SIZE, depth=folder, inpaint=network).provenance()
     assert json.loads(json.dumps(record)) == record
     assert record["depth"] == [{"id": str(folder), "revision": None, "licence": "apache-2.0"}]
-    assert record["inpaint"][0]["id"] == "Windsrain/ZeroStereo" and record["inpaint"][0]["licence"] == "mit"
+    assert record["inpaint"] == [{"id": network.name, "revision": None, "licence": "mit"}]
     builtin = ZeroStereoStream(tar, depth=layered_depth).provenance()
     assert builtin["inpaint"] == [{"id": "builtin", "revision": None, "licence": "apache-2.0"}]
 

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -22,6 +23,7 @@ places = st.builds(
     samples=st.integers(0, 2**63 - 1),
     manifest=st.text(min_size=1),
     configuration=st.text(min_size=1),
+    models=st.dictionaries(st.text(), st.text(), max_size=3),
 )
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
@@ -63,15 +65,22 @@ def test_missing_and_unknown_fields_are_named(missing, unknown):
 
 def test_a_refusal_is_short_whatever_the_state_holds():
     long = "x" * 10**6
-    for change in ({"version": long}, {"seed": long}, {"manifest": long}, {long: 1}, {"epoch": 10**3000}):
+    for change in ({"version": long}, {"seed": long}, {"manifest": long}, {"models": {"depth": long}}, {long: 1}, {"epoch": 10**3000}):
         with pytest.raises(ValueError) as error:
             from_state({**STATE, **change})
         assert len(str(error.value)) < 500
 
 
 def test_the_largest_state_is_small():
-    place = Position(seed=2**63 - 1, epoch=2**63 - 1, samples=2**63 - 1, manifest="f" * 64, configuration="f" * 64)
-    assert len(json.dumps(place.to_state())) < 400
+    models = dict.fromkeys(("depth", "inpaint", "autoencoder"), f"{'n' * 96}@{'f' * 40}")
+    place = Position(seed=2**63 - 1, epoch=2**63 - 1, samples=2**63 - 1, manifest="f" * 64, configuration="f" * 64, models=models)
+    assert len(json.dumps(place.to_state())) < 1000
+
+
+def test_a_model_that_has_moved_is_named_with_both_commits():
+    then, now = (replace(HERE, models={"depth": f"depth-anything/Depth-Anything-V2-Small-hf@{digit * 40}"}) for digit in "ab")
+    with pytest.raises(ValueError, match=r"state's models is \{'depth': '[\w/-]+@a{40}'\}, this stream's is .*@b{40}.*--depth-revision"):
+        from_state(then.to_state(), now)
 
 
 def test_ranks_that_stand_elsewhere_are_named():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from trainers.scores import METRICS
 from trainers.step_guard import TrainingDiverged
 from trainers.training_loss import LOSSES
 from trainers.validation import EvaluationSet
-from zsdata import AdaptiveDisparity, AugmentConfig, DiffusionNetwork, SynthesisConfig, UniformDisparity, ZeroStereoStream
+from zsdata import AdaptiveDisparity, AugmentConfig, DepthNetwork, DiffusionNetwork, SynthesisConfig, UniformDisparity, ZeroStereoStream
 from zsdata.faults import NoUsablePhoto, TooManyFaults, WorkerLost
 from zsdata.sources import parse_sources
 from zsdata.stream import DEPTH_PLACEMENTS
@@ -76,6 +77,7 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PX",
         help="short side of a depth network's input in pixels, or \"native\", the photo's own size (default: the network's own)",
     )
+    stream.add_argument("--depth-revision", metavar="REV", help="branch, tag or commit of a Hub id")
     stream.add_argument(
         "--depth-placement",
         choices=DEPTH_PLACEMENTS,
@@ -84,7 +86,18 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
     )
     stream.add_argument("--depth-cache", metavar="DIR", help="keep each photo's depth there: it is estimated once, not once per epoch")
     stream.add_argument("--inpaint-steps", type=int, metavar="T", help="denoising steps of a diffusion network (default: 50)")
+    stream.add_argument(
+        "--inpaint-scheduler",
+        metavar="NAME",
+        help='of these steps: "ddim", "dpm++", "euler", "lcm", "tcd" or a class of diffusers (default: ddim)',
+    )
+    stream.add_argument(
+        "--inpaint-autoencoder",
+        metavar="NAME",
+        help='another autoencoder, such as the tiny and fast "madebyollin/taesd" (default: its own)',
+    )
     stream.add_argument("--inpaint-subfolder", metavar="NAME", help='where it lies in --inpaint: "StereoGen" in "Windsrain/ZeroStereo"')
+    stream.add_argument("--inpaint-revision", metavar="REV", help="branch, tag or commit of a Hub id")
     stream.add_argument("--views-per-image", type=int, default=1, metavar="K", help="samples in a row from one photo (default: 1)")
     stream.add_argument(
         "--reuse", type=int, default=1, metavar="K", help="samples in a row from one pair, with augmentations of their own (default: 1)"
@@ -210,8 +223,7 @@ def open_stream(arguments: argparse.Namespace) -> ZeroStereoStream:
     return ZeroStereoStream(
         schedule,
         size=tuple(arguments.size),
-        depth=arguments.depth,
-        depth_resolution=None if arguments.depth_resolution is None else _resolution(arguments.depth_resolution),
+        depth=_depth(arguments),
         depth_placement=arguments.depth_placement,
         depth_cache=arguments.depth_cache,
         inpaint=_inpainter(arguments),
@@ -226,18 +238,30 @@ def open_stream(arguments: argparse.Namespace) -> ZeroStereoStream:
     )
 
 
-def _resolution(text: str) -> Any:
-    return int(text) if text.isdecimal() else text
+def _depth(arguments: argparse.Namespace) -> str | DepthNetwork:
+    options = _options_of(arguments, "depth", ("resolution", "revision"))
+    if arguments.depth in ("builtin", "stored"):
+        if options:
+            raise ValueError(f"--depth-{next(iter(options))} belongs to a depth network; --depth is {arguments.depth}")
+        return arguments.depth
+    if options.get("resolution", "").isdecimal():
+        options["resolution"] = int(options["resolution"])
+    return DepthNetwork(arguments.depth, **options)
 
 
 def _inpainter(arguments: argparse.Namespace) -> Any:
-    options = {"steps": arguments.inpaint_steps, "subfolder": arguments.inpaint_subfolder}
-    options = {name: value for name, value in options.items() if value is not None}
+    options = _options_of(arguments, "inpaint", ("steps", "scheduler", "autoencoder", "subfolder", "revision"))
     if arguments.inpaint in ("none", "builtin", "background"):
         if options:
             raise ValueError(f"--inpaint-{next(iter(options))} belongs to a diffusion network; --inpaint is {arguments.inpaint}")
         return leave_black if arguments.inpaint == "none" else arguments.inpaint
     return DiffusionNetwork(arguments.inpaint, **options)
+
+
+def _options_of(arguments: argparse.Namespace, network: str, names: Sequence[str]) -> dict[str, Any]:
+    """Those of a network's options that were given, without its name before them."""
+    given = {name: getattr(arguments, f"{network}_{name}") for name in names}
+    return {name: value for name, value in given.items() if value is not None}
 
 
 def train_config(arguments: argparse.Namespace) -> TrainConfig:

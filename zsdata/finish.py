@@ -20,8 +20,9 @@ from zsdata.prepared import Draft, Drafts, Prepared, make
 from zsdata.sample import Masks, StereoBatch
 from zsdata.seeding import rng
 from zsdata.synthesis.depth import DepthEstimator
+from zsdata.synthesis.depth.maps import DepthMaps
 from zsdata.synthesis.inpaint import Inpainter, fill
-from zsdata.synthesis.synthesizer import INPAINT_CONTEXT_PX, DepthMaps, estimate_depth, predict_depth
+from zsdata.synthesis.synthesizer import INPAINT_CONTEXT_PX, estimate_depth, predict_depth
 from zsdata.worker import Recipe, Worker, naming, single_thread, store_depth
 
 
@@ -120,16 +121,16 @@ class Finisher:
         networks = [self.inpainter, None if self.synthesis is None else self.synthesis.depth]
         return sum(getattr(getattr(network, "micro_batch", None), "lowered", 0) for network in networks)
 
-    def warm_up(self, size: tuple[int, int], batch_size: int) -> list[Any]:
-        """Makes the networks ready for batches of crops of this (height, width), while training has memory and time to spare; what each of
-        them says."""
+    def warm_up(self, size: tuple[int, int], photo: tuple[int, int], batch_size: int) -> list[Any]:
+        """Makes the networks ready for batches of crops of this (height, width), of photos of that one, while training has memory and time
+        to spare; what each of them says."""
         height, width = size
         pairs = 1 + -(-(batch_size - 1) // self.reuse)  # the most distinct ones that a batch can have
         steps: list[tuple[Any, tuple[int, int], int]] = [
             (self.inpainter, (height, width + INPAINT_CONTEXT_PX), min(pairs, self.micro_batch or pairs))
         ]
         if self.synthesis is not None:
-            steps.append((self.synthesis.depth, size, pairs))
+            steps.append((self.synthesis.depth, photo, pairs))
         return [step.warm_up(area, samples) for step, area, samples in steps if hasattr(step, "warm_up")]
 
     @torch.no_grad()

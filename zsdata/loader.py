@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -145,10 +146,7 @@ class StereoLoader:
 
     def state_dict(self) -> dict[str, Any]:
         """The place after the last batch given out: small, plain JSON, the same on every rank; prefetched batches do not count."""
-        place = self._place()
-        return Position(
-            seed=place.seed, epoch=self._epoch, samples=self._samples, manifest=place.manifest, configuration=place.configuration
-        ).to_state()
+        return replace(self._place(), epoch=self._epoch, samples=self._samples).to_state()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Goes to the place that `state_dict` named, with any number of ranks and workers and any batch size.

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import reprlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
-VERSION = 1
+VERSION = 2
 CAUSES = {  # of a difference, by field
     "seed": "the stream's seed differs",
     "manifest": "the photos, their order, the sources or epoch_size differ",
     "configuration": "an option of the stream differs (size, depth, inpaint, disparity, view, augmentation, ...)",
+    "models": "a model has moved on at the Hub; name the commit as its revision (DepthNetwork, DiffusionNetwork; in the trainers "
+    "--depth-revision, --inpaint-revision)",
 }
+_short = reprlib.Repr()
+_short.maxstring = 150  # shows "owner/name@commit" whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,6 +28,7 @@ class Position:
     samples: int
     manifest: str
     configuration: str
+    models: dict[str, str] = field(default_factory=dict)  # those of the Hub: "owner/name@commit" by what they are used for
 
     def to_state(self) -> dict[str, Any]:
         """Plain JSON."""
@@ -41,19 +46,19 @@ class Position:
         """
         if not isinstance(state, Mapping):
             raise ValueError(f"a stream's state is a dictionary as state_dict() returns it; got {type(state).__name__}")
-        names = {"version", *(field.name for field in fields(Position))}
+        names = {"version", *(one.name for one in fields(Position))}
         if state.keys() != names:
-            unknown = reprlib.repr(sorted(map(str, state.keys() - names)))
+            unknown = _short.repr(sorted(map(str, state.keys() - names)))
             raise ValueError(f"not a stream's state: missing {sorted(names - state.keys())}, unknown {unknown}")
         if type(state["version"]) is not int or state["version"] != VERSION:
-            raise ValueError(f"the state's version is {reprlib.repr(state['version'])}; this zsdata reads version {VERSION}")
+            raise ValueError(f"the state's version is {_short.repr(state['version'])}; this zsdata reads version {VERSION}")
         for name in ("epoch", "samples"):
             if type(state[name]) is not int or not 0 <= state[name] < 2**63:
-                raise ValueError(f"the state's {name} must be an integer in 0..2^63 - 1; got {reprlib.repr(state[name])}")
+                raise ValueError(f"the state's {name} must be an integer in 0..2^63 - 1; got {_short.repr(state[name])}")
         for name, cause in CAUSES.items():
             if type(state[name]) is not type(getattr(expected, name)) or state[name] != getattr(expected, name):
                 raise ValueError(
-                    f"the state's {name} is {reprlib.repr(state[name])}, this stream's is {getattr(expected, name)!r}: {cause}. "
+                    f"the state's {name} is {_short.repr(state[name])}, this stream's is {getattr(expected, name)!r}: {cause}. "
                     "Open the stream as it was when the state was saved, or start anew without it."
                 )
         if epoch_size is not None and state["samples"] > epoch_size(state["epoch"]):

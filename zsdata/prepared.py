@@ -12,8 +12,9 @@ from torch import Tensor
 from zsdata.faults import BadPhoto
 from zsdata.meter import Meter
 from zsdata.quality import QualityGate
+from zsdata.synthesis.depth.maps import DepthMaps
 from zsdata.synthesis.indices import count_true
-from zsdata.synthesis.synthesizer import DepthMaps, SynthesisConfig, synthesize
+from zsdata.synthesis.synthesizer import SynthesisConfig, synthesize
 from zsdata.synthesis.view import View
 
 Rejected = tuple[str, str, str, str]  # source, shard, key, reason of a photo that could not be used

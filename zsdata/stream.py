@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import math
 import os
 import sys
 from collections import Counter
@@ -19,6 +20,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 from zsdata.augment import AugmentConfig
 from zsdata.faults import FailureBudget, FaultLog
 from zsdata.finish import Finisher, Synthesis
+from zsdata.hub import hub_models
 from zsdata.licences import fetch_cards, model_records, require_commercial
 from zsdata.loader import SAMPLE_TIMEOUT_SECONDS, StereoLoader
 from zsdata.meter import Meter
@@ -36,7 +38,7 @@ from zsdata.synthesis.depth.identity import depth_identity, pinned
 from zsdata.synthesis.depth.options import STORED
 from zsdata.synthesis.depth.pretrained import preprocessing_of
 from zsdata.synthesis.disparity import AdaptiveDisparity, UniformDisparity
-from zsdata.synthesis.inpaint import DiffusionNetwork, Inpainter, load_inpainter
+from zsdata.synthesis.inpaint import DiffusionNetwork, Inpainter, as_pipeline, checked_pipeline, load_inpainter
 from zsdata.synthesis.micro_batch import WarmUp, say_warm_up
 from zsdata.synthesis.synthesizer import SynthesisConfig
 from zsdata.synthesis.view import ViewConfig
@@ -48,6 +50,9 @@ SMALLEST_CROP_PX = 32
 MOST_SAMPLES_OF_ONE = 100_000  # views of a photo, or uses of a pair; more is a slip
 DEPTH_PLACEMENTS = ("auto", "worker", "device")
 SHARD_CACHE_BYTES = 100_000_000_000
+# A revision is a name for a commit, and it is the commit that counts.
+CHANGES_NO_PICTURE = ("compile", "micro_batch", "memory_gib", "revision", "autoencoder_revision")
+WARM_UP_PHOTOS = 16  # whose sizes tell what networks on the device are made ready for
 DEPTH_CACHE_BYTES = 50_000_000_000  # about 50,000 photos of 480x640
 
 
@@ -82,7 +87,8 @@ class ZeroStereoStream(IterableDataset):
             loader estimates and warps on its device; "auto": on the device for a network whose loader has a GPU, or that was loaded onto
             one, in the workers otherwise. Plain iteration and `replay` do everything on the CPU.
         depth_resolution: the short side of a depth network's input in pixels, or "native", the photo's own size; None is the network's own.
-        commercial_safe: refuses models that are known to be for non-commercial use alone. Of stored depth no model is known.
+        commercial_safe: refuses models that are known to be for non-commercial use alone, and warns of those whose licence is not known, as
+            of stored depth.
         depth_cache: a folder that keeps the depth of every photo, so that a slow estimator is paid once per photo and not once per epoch.
             Any number of workers, ranks and runs may share it.
         depth_cache_bytes: the most that the folder may hold; 3 bytes per pixel of each photo. A full cache keeps what it has.
@@ -152,7 +158,8 @@ class ZeroStereoStream(IterableDataset):
         self._inpaint = inpaint if callable(inpaint) or isinstance(inpaint, DiffusionNetwork) else os.fspath(inpaint)
         self._augmentation = augmentation if augmentation is not None else AugmentConfig()
         self._budget = budget if budget is not None else FailureBudget()
-        inpainter = load_inpainter(self._inpaint) if callable(inpaint) or self._inpaint in ("builtin", "background") else None
+        pipeline = as_pipeline(self._inpaint)
+        inpainter = load_inpainter(self._inpaint) if pipeline is None else None
         if depth == STORED and depth_cache is not None:
             raise ValueError(
                 f'depth="{STORED}" is read from the shards, and depth_cache would keep it a second time; leave depth_cache out '
@@ -160,7 +167,7 @@ class ZeroStereoStream(IterableDataset):
             )
         if depth_resolution is not None:
             if not isinstance(depth, str) or depth in ("builtin", STORED):
-                raise ValueError(f"depth_resolution belongs to a network given by name or folder; depth is {_name_of(depth)!r}")
+                raise ValueError(f"depth_resolution belongs to a network given by name or folder; depth is {_name_of(depth, None)!r}")
             depth = DepthNetwork(depth, resolution=depth_resolution)
         fetch_cards(depth, self._inpaint)
         if commercial_safe:
@@ -170,6 +177,7 @@ class ZeroStereoStream(IterableDataset):
         preprocessing = preprocessing_of(depth)
         network = as_network(depth)
         self._pinned_depth = depth = depth if network is None else pinned(network)
+        self._pinned_inpaint = self._inpaint if pipeline is None else checked_pipeline(pipeline)
         synthesis = synthesis if synthesis is not None else SynthesisConfig()
         self._recipe = Recipe(
             seed=seed,
@@ -279,10 +287,8 @@ class ZeroStereoStream(IterableDataset):
         if self._depth_placement == "auto":
             on_device = self._depth_elsewhere or (device.type != "cpu" and as_network(self._pinned_depth) is not None)
         finisher = self._finisher(device, micro_batch, on_device)
-        if device.type != "cpu" and self._recipe.size is not None:
-            ready = [said for said in finisher.warm_up(self._recipe.size, batch_size) if isinstance(said, WarmUp)]
-            if ready and rank == 0:
-                Progress.write(say_warm_up(ready, device), file=sys.stderr)
+        if device.type != "cpu":
+            self._warm_up(finisher, device, batch_size, aloud=rank == 0)
         return StereoLoader(
             worker=self._drafter() if on_device else self._worker,
             finisher=finisher,
@@ -336,7 +342,7 @@ class ZeroStereoStream(IterableDataset):
             "manifest": place.manifest,
             "configuration": place.configuration,
             "depth": model_records(self._pinned_depth),
-            "inpaint": model_records(self._inpaint),
+            "inpaint": model_records(self._pinned_inpaint),
         }
 
     def _count_problems(self) -> Counter[str]:
@@ -373,7 +379,27 @@ class ZeroStereoStream(IterableDataset):
         if depth_on_device:
             estimator = None if self._pinned_depth == STORED else load_depth(self._pinned_depth, device)
             synthesis = Synthesis(estimator, recipe, self._drafter())
-        return Finisher(load_inpainter(self._inpaint, device), self._augmentation, micro_batch, device, synthesis, recipe.reuse)
+        return Finisher(load_inpainter(self._pinned_inpaint, device), self._augmentation, micro_batch, device, synthesis, recipe.reuse)
+
+    def _warm_up(self, finisher: Finisher, device: torch.device, batch_size: int, aloud: bool) -> None:
+        """Makes the networks on the device ready for batches like the first ones."""
+        size = self._recipe.size
+        photo = self._largest_photo() if size is None or finisher.synthesis is not None else None  # where networks see whole photos
+        size, whole = size or photo, photo or size
+        if size is None or whole is None:
+            return  # not one of them can be used, as the first batch will say
+        ready = [said for said in finisher.warm_up(size, whole, batch_size) if isinstance(said, WarmUp)]
+        if ready and aloud:
+            Progress.write(say_warm_up(ready, device, photo), file=sys.stderr)
+
+    def _largest_photo(self) -> tuple[int, int] | None:
+        """(height, width) of that of the first photos which takes a network most memory."""
+        preprocessing = self._recipe.preprocessing
+
+        def pixels(photo: tuple[int, int]) -> tuple[int, int]:
+            return 0 if preprocessing is None else math.prod(preprocessing.input_size(*photo)), math.prod(photo)
+
+        return max(self._worker.photo_sizes(self._epoch, WARM_UP_PHOTOS), key=pixels, default=None)
 
     def _drafter(self) -> Worker:
         """Prepares all but depth; an estimator that was given loaded does not travel to processes that have no use for it."""
@@ -386,8 +412,8 @@ class ZeroStereoStream(IterableDataset):
             "size": recipe.size,
             "views_per_image": self._views_per_image,
             "reuse": recipe.reuse,
-            "depth": _name_of(self._depth),
-            "inpaint": _name_of(self._inpaint),
+            "depth": _name_of(self._depth, as_network(self._depth)),
+            "inpaint": _name_of(self._inpaint, as_pipeline(self._inpaint)),
             "disparity": [type(recipe.disparity).__name__, asdict(recipe.disparity)],
             "view": asdict(recipe.view),
             "synthesis": asdict(recipe.synthesis),
@@ -395,7 +421,14 @@ class ZeroStereoStream(IterableDataset):
             "augmentation": asdict(self._augmentation),
         }
         digest = hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest()
-        return Position(seed=recipe.seed, epoch=epoch, samples=samples, manifest=self._schedule.digest, configuration=digest)
+        return Position(
+            seed=recipe.seed,
+            epoch=epoch,
+            samples=samples,
+            manifest=self._schedule.digest,
+            configuration=digest,
+            models=hub_models(self._pinned_depth, self._pinned_inpaint),
+        )
 
 
 def _open_cache(
@@ -407,11 +440,13 @@ def _open_cache(
     return DepthCache(folder, max_bytes, f"{depth_identity(depth)}, {confidence}")
 
 
-def _name_of(step: Any) -> Any:
-    """What a step is called in the configuration's digest: what changes its pictures, and nothing else."""
-    loaded = getattr(step, "network", None)
-    if isinstance(loaded, DepthNetwork | DiffusionNetwork):
-        step = loaded
-    if isinstance(step, DepthNetwork | DiffusionNetwork):
-        return {name: value for name, value in asdict(step).items() if name not in ("compile", "micro_batch", "memory_gib")}
+def _name_of(step: Any, network: DepthNetwork | DiffusionNetwork | None) -> Any:
+    """What a step is called in the configuration's digest: what changes its pictures, and nothing else.
+
+    Args:
+        network: of a step that is one by name.
+    """
+    network = network or getattr(step, "network", None)
+    if isinstance(network, DepthNetwork | DiffusionNetwork):
+        return {name: value for name, value in asdict(network).items() if name not in CHANGES_NO_PICTURE}
     return step if isinstance(step, str) else f"{type(step).__module__}.{getattr(step, '__qualname__', type(step).__qualname__)}"

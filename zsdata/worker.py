@@ -25,10 +25,11 @@ from zsdata.source.shard_cache import ShardCache
 from zsdata.sources import Schedule, SourceSet
 from zsdata.synthesis.depth import DepthEstimator, DepthNetwork, load_depth
 from zsdata.synthesis.depth.cache import DepthCache, photo_digest
+from zsdata.synthesis.depth.maps import DepthMaps, depth_maps
 from zsdata.synthesis.depth.options import STORED
 from zsdata.synthesis.depth.preprocessing import Preprocessing
 from zsdata.synthesis.disparity import AdaptiveDisparity, UniformDisparity
-from zsdata.synthesis.synthesizer import INPAINT_CONTEXT_PX, DepthMaps, SynthesisConfig, estimate_depth, given_depth
+from zsdata.synthesis.synthesizer import INPAINT_CONTEXT_PX, SynthesisConfig, estimate_depth
 from zsdata.synthesis.view import ViewConfig, draw_view, view_photo, whole_view
 
 SHORTEST_SIDE_PX = 32  # a photo with a shorter side shows no scene
@@ -105,6 +106,18 @@ class Worker:
         if self._recipe.reuse > 1:
             self._last_pair = ((sources, epoch, pair), made)
         return made
+
+    def photo_sizes(self, epoch: int, most: int) -> list[tuple[int, int]]:
+        """(height, width) of the first photos of an epoch, without those that cannot be used."""
+        sources = self._recipe.schedule.at(epoch)
+        step, sizes = sources.plan.samples_per_photo, []
+        for index in range(0, min(most * step, sources.plan.epoch_size), step):
+            choice = sources.plan.choose(epoch, index)
+            try:
+                sizes.append(self._open(sources, choice, Meter()).size)
+            except (BadPhoto, BadShard):  # counted when its turn comes
+                continue
+        return sizes
 
     def instead(self, draft: Draft, reason: str) -> Draft:
         """What stands in for a draft whose pair, made elsewhere, was refused for `reason`; raises as `prepare`."""
@@ -214,7 +227,7 @@ class Worker:
         if photo.depth is not None:
             return photo.depth
         if photo.stored_depth is not None:
-            photo.depth = given_depth(torch.from_numpy(decode_depth(photo.stored_depth, photo.header))[None, None])
+            photo.depth = depth_maps(torch.from_numpy(decode_depth(photo.stored_depth, photo.header))[None, None], None)
             return photo.depth
         cache = self._recipe.depth_cache
         cached = cache.load(digest, rows) if cache is not None else None

@@ -21,6 +21,7 @@ from tests import oracles_diffusion as oracle
 from tests.scenes import SHARED, photo_tar
 from zsdata import ZeroStereoStream, load_inpainter
 from zsdata.seeding import rng
+from zsdata.synthesis import micro_batch
 from zsdata.synthesis.inpaint import diffusion, fill
 from zsdata.synthesis.inpaint.diffusion import AUTOENCODER_BATCH, latent_mask
 from zsdata.synthesis.inpaint.options import DiffusionNetwork
@@ -149,8 +150,8 @@ def test_a_sample_does_not_depend_on_the_samples_beside_it(folder, scheduler):
     inpainter = load_inpainter(folder, steps=3, scheduler=scheduler)
     right, inpaint_mask = scenes(8)
     whole = inpainter(right, inpaint_mask, generators(*range(8)))
-    for micro_batch in (1, 3, 8, None):
-        assert torch.equal(fill(inpainter, right, inpaint_mask, generators(*range(8)), {}, micro_batch), whole)
+    for at_once in (1, 3, 8, None):
+        assert torch.equal(fill(inpainter, right, inpaint_mask, generators(*range(8)), {}, at_once), whole)
     order = [5, 0, 7, 2]
     assert torch.equal(inpainter(right[order], inpaint_mask[order], generators(*order)), whole[order])
 
@@ -357,6 +358,23 @@ def test_a_pipeline_works_in_the_stream(folder, tmp_path):
     assert len(pairs) == 2 and all(len(values) and torch.isfinite(values).all() and values.std() > 0 for values in holes)
 
 
+def pretend_gpu(inpainter, micro_batch):
+    """Lets it take more than one sample at once, which on the CPU it does not."""
+    inpainter.micro_batch._most = sys.maxsize
+    inpainter.micro_batch.choose(micro_batch)
+    inpainter._largest, inpainter._auto = micro_batch, inpainter.network.micro_batch == "auto"
+
+
+def count_memory(inpainter, per_sample, monkeypatch):
+    """Pretends that a trial takes so many bytes for each sample and half a second; returns the list of the numbers that are tried."""
+    tried = []
+    counted = lambda work, device: (work(), (tried[-1] * per_sample, 0.5))[1]  # noqa: E731
+    monkeypatch.setattr(inpainter, "_try", lambda samples, size: tried.append(samples))
+    monkeypatch.setattr(diffusion, "measure", counted)
+    monkeypatch.setattr(micro_batch, "measure", counted)
+    return tried
+
+
 def limit_memory(inpainter, most, monkeypatch):
     """Lets the U-Net take `most` samples at once."""
     unet = inpainter._unet.forward
@@ -415,10 +433,9 @@ def test_on_a_gpu_the_micro_batch_is_found_and_memory_counted(folder):
 
 def test_auto_takes_what_the_budget_allows(folder, monkeypatch):
     """On a pretended GPU whose need is a quarter of a GiB a sample."""
-    inpainter, tried = load_inpainter(folder, memory_gib=1.2), []
-    monkeypatch.setattr(inpainter, "_try", lambda samples, size: tried.append(samples))
-    monkeypatch.setattr(diffusion, "measure", lambda work, device: (work(), (tried[-1] * 2**28, 0.5))[1])
-    monkeypatch.setattr(inpainter, "_to_be_found", True)
+    inpainter = load_inpainter(folder, memory_gib=1.2)
+    pretend_gpu(inpainter, 1)
+    tried = count_memory(inpainter, 2**28, monkeypatch)
     report = inpainter.warm_up((48, 64))
     assert tried == [1, 2, 4, 4] and report.micro_batch == 4
     assert 2**30 < report.peak_bytes < 1.01 * 2**30  # the small weights are counted too
@@ -430,17 +447,64 @@ def test_auto_takes_what_the_budget_allows(folder, monkeypatch):
 )
 def test_auto_takes_no_more_than_will_come_and_divides_it_evenly(folder, monkeypatch, samples, tried, found):
     """On a pretended GPU where four samples fit: six come as three and three."""
-    inpainter, seen = load_inpainter(folder, memory_gib=1.2), []
-    monkeypatch.setattr(inpainter, "_try", lambda count, size: seen.append(count))
-    monkeypatch.setattr(diffusion, "measure", lambda work, device: (work(), (seen[-1] * 2**28, 0.5))[1])
-    monkeypatch.setattr(inpainter, "_to_be_found", True)
+    inpainter = load_inpainter(folder, memory_gib=1.2)
+    pretend_gpu(inpainter, 1)
+    seen = count_memory(inpainter, 2**28, monkeypatch)
     assert inpainter.warm_up((48, 64), samples).micro_batch == found and seen[: len(tried)] == tried
+
+
+def test_an_inpainter_that_two_loaders_share_is_made_ready_for_each(folder, monkeypatch):
+    """A validation of single pairs must not leave a training of eight with single ones, and a larger crop is tried anew."""
+    inpainter = load_inpainter(folder, memory_gib=2.2)
+    pretend_gpu(inpainter, 1)
+    tried = count_memory(inpainter, 2**28, monkeypatch)
+    ready = [inpainter.warm_up(size, samples).micro_batch for size, samples in [((48, 64), 1), ((48, 64), 8), ((48, 64), 2), ((96, 64), 8)]]
+    assert ready == [1, 8, 2, 8]
+    assert tried == [1, 1, *(1, 2, 4, 8), 8, 2, *(1, 2, 4, 8), 8]
+    asked = load_inpainter(folder, micro_batch=8)
+    pretend_gpu(asked, 8)
+    count_memory(asked, 2**28, monkeypatch)
+    assert [asked.warm_up((48, 64), samples).micro_batch for samples in (2, 8, 12, None)] == [2, 8, 6, 8]
+
+
+def test_a_micro_batch_that_memory_ran_out_with_is_not_tried_again(folder, monkeypatch):
+    inpainter = load_inpainter(folder, micro_batch=8)
+    pretend_gpu(inpainter, 8)
+    limit_memory(inpainter, 4, monkeypatch)
+    assert [inpainter.warm_up((48, 64), samples).micro_batch for samples in (8, 2, 8)] == [4, 2, 4]
+    assert inpainter.micro_batch.lowered == 1
+
+
+def test_what_a_warm_up_says_is_not_the_memory_of_what_did_not_fit(folder, monkeypatch):
+    inpainter, tried = load_inpainter(folder, micro_batch=8), []
+    pretend_gpu(inpainter, 8)
+    limit_memory(inpainter, 4, monkeypatch)
+
+    def largest(work, device):
+        tried.clear()
+        work()
+        return max(tried) * 2**28, 0.5
+
+    one_try = inpainter._try
+    monkeypatch.setattr(inpainter, "_try", lambda samples, size: tried.append(samples) or one_try(samples, size))
+    monkeypatch.setattr(micro_batch, "measure", largest)
+    report = inpainter.warm_up((48, 64))
+    assert (report.micro_batch, report.peak_bytes - report.weights, report.seconds) == (4, 4 * 2**28, 1)
+
+
+def test_without_a_warm_up_no_more_are_tried_than_have_come(folder, monkeypatch):
+    inpainter = load_inpainter(folder, steps=2, memory_gib=8.0)
+    pretend_gpu(inpainter, 1)
+    tried = count_memory(inpainter, 2**28, monkeypatch)
+    for count in (1, 1, 3, 2):
+        inpainter(*scenes(count), generators(*range(count)))
+    assert tried == [1, *(1, 2)]
 
 
 def test_a_memory_limit_that_cannot_be_held_is_said(folder, monkeypatch, caplog):
     inpainter = load_inpainter(folder, memory_gib=0.1)
     monkeypatch.setattr(diffusion, "measure", lambda work, device: (2**28, 0.5))
-    monkeypatch.setattr(inpainter, "_to_be_found", True)
+    pretend_gpu(inpainter, 1)
     with caplog.at_level(logging.WARNING, "zsdata"):
         assert inpainter.warm_up((48, 64)).micro_batch == 1
     assert "memory_gib=0.1 cannot be held: one sample and the weights take 0.25 GiB" in caplog.text
@@ -458,6 +522,50 @@ def test_a_compiled_network_sees_one_size_alone(folder, inpainter, monkeypatch):
         made = compiled(right, inpaint_mask, generators(*range(5)))
     assert set(seen) == {3}
     assert torch.allclose(made, inpainter(right, inpaint_mask, generators(*range(5))), rtol=0, atol=1e-4 * 127.5)
+
+
+@pytest.mark.filterwarnings("ignore:.*script_method.*:DeprecationWarning")  # PyTorch's own compiler
+def test_a_compiled_network_that_runs_out_of_memory_takes_half_of_what_it_was_filled_up_to(folder, monkeypatch):
+    """Three samples, filled up to eight, of which four fit: four are tried next, and not one."""
+    compiled = load_inpainter(folder, steps=2, compile=True, micro_batch=8)
+    pretend_gpu(compiled, 8)
+    limit_memory(compiled, 4, monkeypatch)
+    with torch.compiler.set_stance("force_eager"):
+        compiled(*scenes(3), generators(0, 1, 2))
+        assert (compiled.micro_batch.size, compiled.micro_batch.lowered) == (4, 1)
+        compiled(*scenes(1), generators(0))
+    assert compiled.micro_batch.lowered == 1
+
+
+@pytest.mark.filterwarnings("ignore:.*script_method.*:DeprecationWarning")  # PyTorch's own compiler
+def test_auto_tries_a_compiled_network_as_it_is(folder, monkeypatch):
+    compiled, seen = load_inpainter(folder, steps=1, compile=True, memory_gib=1.2), []
+    pretend_gpu(compiled, 1)
+    unet = compiled._unet.forward
+    monkeypatch.setattr(compiled._unet, "forward", lambda noisy, *_, **__: seen.append(len(noisy)) or unet(noisy, *_, **__))
+    for module in (diffusion, micro_batch):
+        monkeypatch.setattr(module, "measure", lambda work, device: (work(), (seen[-1] * 2**28, 0.5))[1])
+    with torch.compiler.set_stance("force_eager"):
+        assert compiled.warm_up((48, 64), 3).micro_batch == 2
+        assert seen == [1, 2, 2]
+        seen.clear()
+        compiled(*scenes(3), generators(0, 1, 2))
+    assert seen == [2, 2]
+
+
+@pytest.mark.filterwarnings("ignore:.*script_method.*:DeprecationWarning")  # PyTorch's own compiler
+def test_a_compiled_network_takes_single_images_as_such_where_it_was_made_ready_for_them(folder, monkeypatch):
+    compiled, seen = load_inpainter(folder, steps=1, compile=True, micro_batch=8), []
+    pretend_gpu(compiled, 8)
+    unet = compiled._unet.forward
+    monkeypatch.setattr(compiled._unet, "forward", lambda noisy, *_, **__: seen.append(len(noisy)) or unet(noisy, *_, **__))
+    with torch.compiler.set_stance("force_eager"):
+        for samples in (1, 8):
+            compiled.warm_up((48, 64), samples)
+        seen.clear()
+        for count in (1, 3, 8):
+            compiled(*scenes(count), generators(*range(count)))
+    assert seen == [1, 8, 8]
 
 
 def test_no_samples_are_no_work(inpainter):

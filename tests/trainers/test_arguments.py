@@ -3,7 +3,12 @@ import argparse
 import pytest
 
 from tests.scenes import photo_tar
+from tests.small_depth_networks import save_small_network
+from tests.small_pipeline import save_small_pipeline
 from trainers.arguments import add_training_arguments, labels_are_trusted, open_stream
+from zsdata import DepthNetwork, DiffusionNetwork, ZeroStereoStream
+
+diffusers = pytest.importorskip("diffusers")
 
 pytestmark = pytest.mark.filterwarnings("ignore:The built-in depth")
 
@@ -33,19 +38,33 @@ def test_labels_are_trusted_where_nothing_tells_their_confidence():
     assert trusted == [False, True, True]
 
 
-def test_a_diffusion_network_takes_its_steps_and_its_subfolder(tar):
-    model = ("--inpaint", "Windsrain/ZeroStereo", "--inpaint-subfolder", "StereoGen", "--inpaint-steps", "4")
-    record = open_stream(parsed("--sources", tar, *model)).provenance()
-    assert record["inpaint"][0]["id"] == "Windsrain/ZeroStereo"
-    assert record["configuration"] == open_stream(parsed("--sources", tar, *model)).provenance()["configuration"]
-    assert record["configuration"] != open_stream(parsed("--sources", tar, *model[:4])).provenance()["configuration"]
+def test_networks_take_their_options(tar, tmp_path):
+    depth = save_small_network("depth_anything", tmp_path / "depth")
+    pipeline, tiny = save_small_pipeline(tmp_path / "all" / "StereoGen").parent, tmp_path / "tiny"
+    diffusers.AutoencoderTiny().save_pretrained(tiny)
+    model = ["--depth", str(depth), "--inpaint", str(pipeline), "--inpaint-subfolder", "StereoGen"]
+    options = ["--depth-resolution", "56", "--inpaint-steps", "4", "--inpaint-scheduler", "lcm", "--inpaint-autoencoder", str(tiny)]
+    told, plain = (open_stream(parsed("--sources", tar, *model, *more)) for more in (options, []))
+    expected = ZeroStereoStream(
+        tar,
+        depth=DepthNetwork(str(depth), resolution=56),
+        inpaint=DiffusionNetwork(str(pipeline), steps=4, scheduler="lcm", subfolder="StereoGen", autoencoder=str(tiny)),
+    )
+    assert told.provenance() == expected.provenance() != plain.provenance()
+    assert [record["id"] for record in told.provenance()["inpaint"]] == [str(pipeline), str(tiny)]
+    for which, name in (("depth", str(depth)), ("inpaint", str(pipeline))):
+        with pytest.raises(ValueError, match=f"{name}.* is a folder, which has no revisions"):
+            open_stream(parsed("--sources", tar, *model, f"--{which}-revision", "v1"))
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (("--inpaint-steps", "4"), "belongs to a diffusion network; --inpaint is builtin"),
-        (("--depth-resolution", "518"), "depth_resolution belongs to a network"),
+        (("--depth-resolution", "518"), "--depth-resolution belongs to a depth network; --depth is builtin"),
+        (("--depth", "stored", "--depth-revision", "v1"), "--depth-revision belongs to a depth network; --depth is stored"),
+        (("--depth", "owner/name", "--depth-resolution", "large"), "resolution"),
+        (("--inpaint", "/no/such/folder"), '"/no/such/folder" is neither a folder nor a Hub id'),
         (("--depth", "depth-anything/Depth-Anything-V2-Large-hf", "--commercial-safe"), "no commercial use"),
         (("--depth", "/no/such/folder"), r'depth="/no/such/folder" is neither .* a folder that is there, nor a Hub id'),
         (("--views-per-image", "0"), "views_per_image is an integer, 1 or more"),

@@ -6,6 +6,7 @@ On the CPU it is always one: in a batch the order of sums, and with it the last 
 from __future__ import annotations
 
 import logging
+import sys
 import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
@@ -43,13 +44,15 @@ class WarmUp(NamedTuple):
         return f"{self.what}: micro-batch {self.micro_batch}{peak}, warm after {self.seconds:.1f} s"
 
 
-def say_warm_up(ready: Sequence[WarmUp], device: torch.device) -> str:
-    """What the networks of a stream said of their warm-up, a line each; and how much memory of the device they take in all."""
+def say_warm_up(ready: Sequence[WarmUp], device: torch.device, photo: tuple[int, int] | None = None) -> str:
+    """What the networks of a stream said of their warm-up, a line each; and how much memory of the device they take in all, where they
+    work on whole photos for those of at most this (height, width)."""
     lines = [f"zsdata on {device}: {said}" for said in ready]
     activations = [said.peak_bytes - said.weights for said in ready if said.peak_bytes is not None]
     if activations:
         peak = sum(said.weights for said in ready) + max(activations)  # weights stay, activations come one after another
-        lines.append(f"zsdata on {device}: the stream takes at most {peak / GIB:.2f} GiB beside training")
+        photos = "" if photo is None else f", for photos of up to {photo[0]}x{photo[1]}"
+        lines.append(f"zsdata on {device}: the stream takes at most {peak / GIB:.2f} GiB beside training{photos}")
     return "\n".join(lines)
 
 
@@ -67,11 +70,19 @@ class MicroBatch:
 
     def __init__(self, what: str, size: int, device: torch.device, cure: str) -> None:
         self.what, self.cure, self.device = what, cure, device
-        self.size = 1 if device.type == "cpu" else size
+        self._most = 1 if device.type == "cpu" else sys.maxsize
         self.lowered = 0
+        self.choose(size)
 
-    def run(self, work: Callable[[slice], Made], total: int) -> list[Made]:
+    def choose(self, size: int) -> None:
+        """So many samples at once from now on; fewer where memory has run out before."""
+        self.size = min(size, self._most)
+
+    def run(self, work: Callable[[slice], Made], total: int, rows: Callable[[int], int] = int) -> list[Made]:
         """`work(part)` for parts of at most `size` that cover range(total), in order.
+
+        Args:
+            rows: how many samples the work makes of a part of so many: more, where it is filled up.
 
         Raises:
             MemoryError: a single sample does not fit.
@@ -90,14 +101,23 @@ class MicroBatch:
             if failed is None:
                 start = stop
             else:
-                self._lower(stop - start, failed)
+                self._lower(rows(stop - start), failed)
         return made
+
+    def measure(self, work: Callable[[], object]) -> tuple[int | None, float]:
+        """As the function of that name; once more where memory ran out on the way, as the peak would be that of what did not fit."""
+        lowered = self.lowered
+        peak, seconds = measure(work, self.device)
+        if self.lowered > lowered:
+            peak, again = measure(work, self.device)
+            seconds += again
+        return peak, seconds
 
     def _lower(self, tried: int, error: RuntimeError) -> None:
         self.lowered += 1
         if tried == 1:
             raise MemoryError(f"{self.device} has not enough memory for one sample ({self.what}): {self.cure}") from error
-        self.size = tried // 2
+        self.size = self._most = tried // 2
         logger.warning(
             "%s ran out of memory (%s) with %d samples at once; from now on it takes %d, and nothing else changes. "
             "To avoid it, set micro_batch=%d",

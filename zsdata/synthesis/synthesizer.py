@@ -6,37 +6,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from zsdata.field_types import check_types
 from zsdata.meter import Meter
-from zsdata.synthesis.confidence import flip_confidence, flip_consistency, normalize_inverse_depth
 from zsdata.synthesis.depth import DepthEstimator
+from zsdata.synthesis.depth.maps import CERTAIN, NEAREST, DepthMaps, depth_maps
 from zsdata.synthesis.disparity import SMALLEST_DISPARITY_PX, dilate_disparity, sharpen_disparity
 from zsdata.synthesis.view import View, view_map
 from zsdata.synthesis.warp import forward_warp
-
-NEAREST = 65_535  # the inverse depth of the photo's nearest point; a step is 1/500 px of the largest disparity that any photo is given
-CERTAIN = 255  # the confidence of a label that is trusted entirely
-
-
-class DepthMaps(NamedTuple):
-    """What is known of a photo's depth, whatever is drawn from it; as whole numbers, so that it can be kept and comes back bit for bit.
-
-    Attributes:
-        inverse_depth: uint16 [B, 1, h, w], 0 (farthest) to NEAREST.
-        confidence: uint8 [B, 1, h, w], 0 to CERTAIN.
-        consistency: float64 [B], the mean flip consistency before normalisation.
-        first_row: of the maps in the photo, where they are a part of it.
-    """
-
-    inverse_depth: Tensor
-    confidence: Tensor
-    consistency: Tensor
-    first_row: int = 0
-
 
 INPAINT_CONTEXT_PX = 32  # a hole at the crop's right edge is filled from its background, which begins beyond that edge
 
@@ -78,18 +57,12 @@ def estimate_depth(depth: DepthEstimator, photos: Tensor, config: SynthesisConfi
     """
     together = getattr(depth, "with_mirrored", None)
     if not config.flip_confidence:
-        return _depth_maps(_checked(depth(photos), photos), None)
+        return depth_maps(_checked(depth(photos), photos), None)
     if together is not None:
         estimate, mirrored = (_checked(maps, photos) for maps in together(photos))
     else:
         estimate, mirrored = _checked(depth(photos), photos), _checked(depth(photos.flip(-1)), photos).flip(-1)
-    return _depth_maps(estimate, mirrored)
-
-
-def given_depth(inverse_depth: Tensor) -> DepthMaps:
-    """As `estimate_depth`, of maps that are there already, float [B, 1, h, w]. Nothing is known of the mirrored photo, so every label has
-    confidence 1, as without `flip_confidence`."""
-    return _depth_maps(inverse_depth, None)
+    return depth_maps(estimate, mirrored)
 
 
 def predict_depth(depth: Any, prepared: Sequence[Tensor], sizes: Sequence[tuple[int, int]], config: SynthesisConfig) -> Iterator[DepthMaps]:
@@ -101,26 +74,13 @@ def predict_depth(depth: Any, prepared: Sequence[Tensor], sizes: Sequence[tuple[
         sizes: (height, width) of the photos.
 
     Returns:
-        One map per photo. The estimator has done its work when this returns; each map is checked when it is taken.
+        One map per photo. The network has done its work when this returns; each map is made when it is taken.
     """
     if config.flip_confidence:
-        estimates: Sequence[tuple[Tensor, Tensor | None]] = depth.predict_mirrored(prepared, sizes)
+        estimates: Iterator[tuple[Tensor, Tensor | None]] = depth.predict_mirrored(prepared, sizes)
     else:
-        estimates = [(estimate, None) for estimate in depth.predict(prepared, sizes)]
-    return (_depth_maps(*maps) for maps in estimates)
-
-
-def _depth_maps(estimate: Tensor, mirrored: Tensor | None) -> DepthMaps:
-    """What is known from inverse depth and, in the same frame, that of the mirrored photo."""
-    inverse_depth = normalize_inverse_depth(estimate)
-    if mirrored is None:
-        confidence = torch.full_like(inverse_depth, CERTAIN, dtype=torch.uint8)
-        consistency = torch.ones(len(inverse_depth), dtype=torch.float64)
-    else:
-        mirrored = normalize_inverse_depth(mirrored)
-        confidence = (flip_confidence(inverse_depth, mirrored) * CERTAIN).round_().int().to(torch.uint8)
-        consistency = flip_consistency(inverse_depth, mirrored)
-    return DepthMaps((inverse_depth * NEAREST).round_().int().to(torch.uint16), confidence, consistency)
+        estimates = ((estimate, None) for estimate in depth.predict(prepared, sizes))
+    return (depth_maps(*maps) for maps in estimates)
 
 
 def synthesize(photo_view: Tensor, depth: DepthMaps, view: View, scale: float, config: SynthesisConfig, meter: Meter) -> Synthesized:

@@ -33,8 +33,9 @@ def depth_identity(depth: str | os.PathLike[str] | DepthNetwork | Callable[..., 
     - A Hub id: the id, and the commit that it stands for in the local Hub cache. Nothing is downloaded: an id that is not there yet is an
       error, because maps of an unknown commit could not be told from those of the next one.
     - A `DepthNetwork`: its folder or Hub id, and the options that change its output.
-    - A callable: its attribute `cache_name`, which whoever changes the callable also changes. No name is guessed: code and weights of a
-      callable cannot be seen from outside, and wrong depth would come out of the cache without a word.
+    - What `load_depth` loaded: as the `DepthNetwork` that it was loaded from.
+    - Another callable: its attribute `cache_name`, which whoever changes the callable also changes. No name is guessed: code and weights
+      of a callable cannot be seen from outside, and wrong depth would come out of the cache without a word.
 
     Raises:
         FileNotFoundError: a Hub id that is not in the local Hub cache, or a folder without config.json.
@@ -50,6 +51,9 @@ def depth_identity(depth: str | os.PathLike[str] | DepthNetwork | Callable[..., 
         return f"{_name_identity(depth.name, depth.revision)}{said}"
     if callable(depth):
         name = getattr(depth, "cache_name", None)
+        loaded = getattr(depth, "pinned", None)
+        if name is None and isinstance(loaded, DepthNetwork):
+            return depth_identity(loaded)
         if not isinstance(name, str) or not name.strip():
             raise ValueError(
                 f"depth_cache needs to know which estimator {depth!r} is; got cache_name {name!r}. Give it a name that changes with its "

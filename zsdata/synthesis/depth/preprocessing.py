@@ -29,7 +29,6 @@ CLASS_DEFAULTS: dict[str, dict[str, Any]] = {
     "DPT": {"size": 384, "resample": 3, "image_mean": HALF, "image_std": HALF},
     "DepthPro": {"size": 1536, "resample": 2, "image_mean": HALF, "image_std": HALF, "antialias": False},
     "GLPN": {"do_normalize": False, "resample": 2, "size_divisor": 32},
-    "PromptDepthAnything": {"size": 384, "resample": 3, "image_mean": HALF, "image_std": HALF},
     "Tipsv2Dpt": {"do_normalize": False, "size": 448, "resample": 2},
     "ZoeDepth": {
         "size": {"height": 384, "width": 512},

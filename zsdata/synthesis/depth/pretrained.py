@@ -18,17 +18,21 @@ import torch
 from torch import Tensor
 
 from zsdata.synthesis.depth import DepthEstimator, as_network
+from zsdata.synthesis.depth.identity import pinned
+from zsdata.synthesis.depth.maps import depth_maps
 from zsdata.synthesis.depth.model_folder import check_weights
 from zsdata.synthesis.depth.options import DepthNetwork
 from zsdata.synthesis.depth.preprocessing import Preprocessing, read_preprocessing
-from zsdata.synthesis.micro_batch import MicroBatch, WarmUp, measure, to_device, weight_bytes
+from zsdata.synthesis.micro_batch import MicroBatch, WarmUp, out_of_memory, to_device, weight_bytes
 from zsdata.synthesis.precision import DTYPES, without_tf32
 
 # What a network's prediction is, by the model_type of its configuration, which may say "metric" besides. Depth Pro's is inverse depth:
 # transformers inverts it afterwards. CHMv2's is the height of trees seen from above: what is higher is nearer, as inverse depth has it.
-INVERSE_DEPTH_MODELS = ("chmv2", "depth_anything", "depth_pro", "prompt_depth_anything")
+INVERSE_DEPTH_MODELS = ("chmv2", "depth_anything", "depth_pro")
 DEPTH_MODELS = ("glpn", "tipsv2_dpt", "zoedepth")
 METRIC_DPT_BACKBONES = ("dinov2", "dinov2_with_registers")  # DPT heads on DINOv2 predict metres (NYU, KITTI); MiDaS's predict inverse depth
+
+PROMPTED_MODELS = ("prompt_depth_anything",)  # without the depth that they ask for their nearest point is at 0: nothing to invert
 
 SMALLEST_DEPTH_M = 1e-3
 NEAREST_SHARE = 0.001  # of a photo's pixels may be nearer than the depth that is taken for its nearest point
@@ -51,6 +55,10 @@ class PretrainedDepth:
         network: which one, and how it is run.
         device: where the network is put.
 
+    Attributes:
+        network, device: as given.
+        pinned: the network at the commit that it was loaded from.
+
     Raises:
         ImportError: transformers is not installed.
         OSError: nothing is found under that name, or a folder lacks a file.
@@ -62,11 +70,12 @@ class PretrainedDepth:
         self.network, self.device = network, torch.device(device)
         self.dtype = DTYPES[network.dtype]
         self.preprocessing = load_preprocessing(network)
+        self.pinned = pinned(network)
         from transformers import AutoModelForDepthEstimation
 
         with _naming(network), torch.random.fork_rng(devices=[]):  # older transformers fill the weights with random numbers first
             loaded, report = AutoModelForDepthEstimation.from_pretrained(
-                network.name, revision=network.revision, output_loading_info=True, ignore_mismatched_sizes=True
+                network.name, revision=self.pinned.revision, output_loading_info=True, ignore_mismatched_sizes=True
             )
         missing = sorted(key for key in report["missing_keys"] if not NEVER_USED.search(key))
         if missing:
@@ -77,7 +86,7 @@ class PretrainedDepth:
                 f'depth="{network.name}" has {len(other)} weights of another shape than its config.json says, "{other[0]}" for one; '
                 "download both again"
             )
-        self._predicts_depth = (network.predicts or _predicts(network.name, loaded.config)) == "depth"
+        self._predicts_depth = _predicts(network, loaded.config) == "depth"
         self._network: Any = loaded.float().eval().requires_grad_(False)  # saved in half precision or not
         cure = "lower resolution, or take a smaller network or dtype"
         to_device((self._network,), self.device, "the depth network", cure)
@@ -94,6 +103,10 @@ class PretrainedDepth:
         alone = len(getattr(loaded.config, "bin_configurations", None) or ()) > 1
         self.micro_batch = MicroBatch("depth network", 1 if alone else network.micro_batch, self.device, cure)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Another process loads it anew: transformers and `compile` hang functions on a network that do not travel."""
+        return PretrainedDepth, (self.pinned, self.device)
+
     def prepare(self, images: Tensor) -> Tensor:
         """The first half: photos to the network's input.
 
@@ -105,8 +118,7 @@ class PretrainedDepth:
         """
         return self.preprocessing.prepare(images)
 
-    @torch.inference_mode()
-    def predict(self, inputs: Sequence[Tensor], sizes: Sequence[tuple[int, int]]) -> list[Tensor]:
+    def predict(self, inputs: Sequence[Tensor], sizes: Sequence[tuple[int, int]]) -> Iterator[Tensor]:
         """The second half: inverse depth of prepared photos; those of one input size share micro-batches.
 
         Args:
@@ -114,25 +126,17 @@ class PretrainedDepth:
             sizes: (height, width) of each photo.
 
         Returns:
-            One float32 [1, 1, H, W] per photo, larger is nearer, on the network's device.
+            One float32 [1, 1, H, W] per photo, larger is nearer, on the network's device. The network has done its work when this returns;
+            each map is brought to its photo's size when it is taken: those of a whole batch may not fit into memory at once.
 
         Raises:
             MemoryError: the device has not enough memory for one photo.
         """
         if len(inputs) != len(sizes):
             raise ValueError(f"one size per photo: {len(inputs)} inputs, {len(sizes)} sizes")
-        alike: dict[tuple[int, ...], list[int]] = defaultdict(list)
-        for place, prepared in enumerate(inputs):
-            alike[tuple(prepared.shape)].append(place)
-        made: dict[int, Tensor] = {}
-        for places in alike.values():
-            together = torch.cat([inputs[place].to(self.device, non_blocking=True) for place in places])
-            predicted = torch.cat(self.micro_batch.run(lambda part, together=together: self._run(together[part]), len(places)))
-            for place, one in zip(places, predicted.split(1), strict=True):
-                made[place] = self.preprocessing.restore(one, sizes[place])
-        return [made[place] for place in range(len(inputs))]
+        return map(self._restore, self._predict(inputs), sizes)
 
-    def predict_mirrored(self, inputs: Sequence[Tensor], sizes: Sequence[tuple[int, int]]) -> list[tuple[Tensor, Tensor]]:
+    def predict_mirrored(self, inputs: Sequence[Tensor], sizes: Sequence[tuple[int, int]]) -> Iterator[tuple[Tensor, Tensor]]:
         """As `predict`, of every photo and of its mirror image, in the same micro-batches.
 
         Returns:
@@ -140,7 +144,32 @@ class PretrainedDepth:
         """
         both = [image for prepared in inputs for image in (prepared, prepared.flip(-1))]
         made = self.predict(both, [size for size in sizes for _ in range(2)])
-        return [(one, mirrored.flip(-1)) for one, mirrored in zip(made[::2], made[1::2], strict=True)]
+        return ((one, mirrored.flip(-1)) for one, mirrored in zip(made, made, strict=True))
+
+    @torch.inference_mode()
+    def _predict(self, inputs: Sequence[Tensor]) -> list[Tensor]:
+        """Inverse depth of prepared photos, at the size that the network gives it."""
+        alike: dict[tuple[int, ...], list[int]] = defaultdict(list)
+        for place, prepared in enumerate(inputs):
+            alike[tuple(prepared.shape)].append(place)
+        made: dict[int, Tensor] = {}
+        for places in alike.values():
+            together = torch.cat([inputs[place].to(self.device, non_blocking=True) for place in places])
+            predicted = torch.cat(self.micro_batch.run(lambda part, together=together: self._run(together[part]), len(places)))
+            made.update(zip(places, predicted.split(1), strict=True))
+        return [made[place] for place in range(len(inputs))]
+
+    @torch.inference_mode()
+    def _restore(self, predicted: Tensor, size: tuple[int, int]) -> Tensor:
+        try:
+            return self.preprocessing.restore(predicted, size)
+        except RuntimeError as error:
+            if not out_of_memory(error):
+                raise
+            raise MemoryError(
+                f"{self.device} has not enough memory for the depth of a photo of {size[1]}x{size[0]}: lower memory elsewhere, take "
+                'smaller photos, or depth_placement="worker"'
+            ) from error
 
     def __call__(self, images: Tensor) -> Tensor:
         """Inverse depth of `images`: both halves.
@@ -152,7 +181,7 @@ class PretrainedDepth:
             float32 [B, 1, H, W], larger is nearer, on the device of `images`.
         """
         sizes = [(images.shape[-2], images.shape[-1])] * len(images)
-        return torch.cat(self.predict(self.prepare(images).split(1), sizes)).to(images.device)
+        return torch.cat(list(self.predict(self.prepare(images).split(1), sizes))).to(images.device)
 
     def with_mirrored(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Inverse depth of `images` and of their mirror images, mirrored back, each as `__call__` returns it."""
@@ -168,13 +197,19 @@ class PretrainedDepth:
             size: height and width of the photos.
             samples: the most photos that will come at once, each with its mirror image; None is not known.
         """
-        if samples is not None:
-            self.micro_batch.size = min(self.micro_batch.size, 2 * samples)
-        inputs = [self.prepare(torch.full((1, 3, *size), 127, dtype=torch.uint8))] * self.micro_batch.size
-        peak, seconds = measure(lambda: self.predict(inputs, [size] * len(inputs)), self.device)
-        what = f"depth {self.network.name} at {inputs[0].shape[-2]}x{inputs[0].shape[-1]}, {self.dtype}"
+        images = self.micro_batch.size if samples is None else min(self.micro_batch.size, 2 * samples)
+        grey = self.prepare(torch.full((1, 3, *size), 127, dtype=torch.uint8))
+        photos = -(-images // 2)  # each is two images
+
+        def work() -> None:
+            for maps in self.predict_mirrored([grey] * photos, [size] * photos):
+                depth_maps(*maps)
+
+        peak, seconds = self.micro_batch.measure(work)
+        what = f"depth {self.network.name} at {grey.shape[-2]}x{grey.shape[-1]} for photos of {size[0]}x{size[1]}, {self.dtype}"
         weights = weight_bytes(self._network)
-        return WarmUp(what, self.micro_batch.size, None if peak is None else peak + weights, weights, seconds)
+        size_in_use = min(self.micro_batch.size, 2 * photos)
+        return WarmUp(what, size_in_use, None if peak is None else peak + weights, weights, seconds)
 
     def _run(self, inputs: Tensor) -> Tensor:
         """uint8 [B, 3, h, w] on the device to inverse depth, float32 [B, 1, h', w']."""
@@ -235,6 +270,7 @@ def load_preprocessing(network: DepthNetwork) -> Preprocessing:
             f'depth="{network.name}" is no depth network: its config.json says {" ".join([config.model_type, *built_as])}; name one that '
             "transformers loads by AutoModelForDepthEstimation"
         )
+    _predicts(network, config)
     if os.path.isdir(network.name):
         check_weights(network.name)
     with open(str(path), encoding="utf-8") as file:
@@ -262,8 +298,16 @@ def _naming(network: DepthNetwork) -> Iterator[None]:
         ) from error
 
 
-def _predicts(name: str, config: Any) -> str:
-    kind = config.model_type
+def _predicts(network: DepthNetwork, config: Any) -> str:
+    """As told, or as its configuration (transformers) tells."""
+    kind, name = config.model_type, network.name
+    if kind in PROMPTED_MODELS:
+        raise ValueError(
+            f'depth="{name}" is a {kind} network, which wants a depth map beside the photo; take one that needs the photo alone, such as '
+            '"depth-anything/Depth-Anything-V2-Small-hf"'
+        )
+    if network.predicts is not None:
+        return network.predicts
     if kind in DEPTH_MODELS or getattr(config, "depth_estimation_type", "relative") == "metric":
         return "depth"
     if kind == "dpt":

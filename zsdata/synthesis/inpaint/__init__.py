@@ -20,6 +20,8 @@ from zsdata.synthesis.inpaint.options import DiffusionNetwork
 
 Inpainter = Callable[..., Tensor]
 
+BUILT_IN = ("builtin", "background")
+
 
 def load_inpainter(
     inpaint: str | os.PathLike[str] | DiffusionNetwork | Inpainter, device: str | torch.device = "cpu", **options: Any
@@ -44,7 +46,7 @@ def load_inpainter(
             raise TypeError(f"a callable inpainter takes no options; got {sorted(options)}")
         return inpaint
     name = os.fspath(inpaint)
-    if name in ("builtin", "background"):
+    if name in BUILT_IN:
         if options:
             raise TypeError(f'inpaint="{name}" takes no options; got {sorted(options)}')
         if name == "builtin":
@@ -55,6 +57,27 @@ def load_inpainter(
 
         return RandomBackground()
     return _diffusion(DiffusionNetwork(name, **options), device)
+
+
+def as_pipeline(inpaint: str | os.PathLike[str] | DiffusionNetwork | Inpainter) -> DiffusionNetwork | None:
+    """The pipeline behind the stream's `inpaint` argument, where that names one; None for built-in inpainters and callables."""
+    if isinstance(inpaint, DiffusionNetwork):
+        return inpaint
+    if callable(inpaint) or os.fspath(inpaint) in BUILT_IN:
+        return None
+    return DiffusionNetwork(os.fspath(inpaint))
+
+
+def checked_pipeline(network: DiffusionNetwork) -> DiffusionNetwork:
+    """The pipeline at the commit that its name stands for; all is checked that can be without loading weights.
+
+    Raises:
+        ImportError: the "diffusion" extra is not installed.
+        OSError, ValueError: it cannot be loaded, or not with these options.
+    """
+    from zsdata.synthesis.inpaint.diffusion import checked
+
+    return checked(network)
 
 
 def _diffusion(network: DiffusionNetwork, device: str | torch.device) -> Inpainter:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import inspect
 import logging
+import math
 import sys
 from collections.abc import Sequence
 from copy import deepcopy
@@ -19,7 +20,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from zsdata.synthesis.inpaint.diffusion_parts import CELL_PX, LATENT_CHANNELS, load_diffusion_parts
+from zsdata.synthesis.inpaint.diffusion_parts import CELL_PX, LATENT_CHANNELS, at_commit, load_diffusion_parts, read_scheduler_config
 from zsdata.synthesis.inpaint.options import DiffusionNetwork
 from zsdata.synthesis.inpaint.schedulers import make_scheduler
 from zsdata.synthesis.micro_batch import (
@@ -55,6 +56,7 @@ class DiffusionInpainter:
 
     Attributes:
         network, device: as given.
+        pinned: the network at the commit that it was loaded from.
         steps, dtype, scheduler: what was chosen: denoising steps, the networks' torch.dtype, the scheduler's class name.
         micro_batch: how many samples go through the U-Net at once (`.size`), and how often that had to be lowered (`.lowered`).
 
@@ -68,7 +70,8 @@ class DiffusionInpainter:
         self.network, self.steps = network, network.steps
         self.device = torch.device(device)
         self.dtype = choose_dtype(network.dtype, self.device)
-        parts = load_diffusion_parts(network.name, network.subfolder, network.revision, network.autoencoder, self.dtype)
+        self.pinned = checked(network)
+        parts = load_diffusion_parts(self.pinned, self.dtype)
         self._scheduler = make_scheduler(network.scheduler, parts.scheduler_config, network.steps)
         self.scheduler = type(self._scheduler).__name__
         cure = 'lower memory elsewhere, take a smaller crop, dtype="bf16" or "fp16", or a tiny autoencoder; fewer steps would not help'
@@ -79,9 +82,11 @@ class DiffusionInpainter:
             mode = network.compile if isinstance(network.compile, str) else None
             for module in (self._unet, self._autoencoder.encoder, self._autoencoder.decoder):
                 module.compile(mode=mode)
-        asked = 1 if network.micro_batch == "auto" else network.micro_batch
-        self.micro_batch = MicroBatch("diffusion inpainting", asked, self.device, cure)
-        self._to_be_found = network.micro_batch == "auto" and self.device.type != "cpu"
+        self._auto = network.micro_batch == "auto" and self.device.type != "cpu"
+        self._largest = 1 if network.micro_batch == "auto" else network.micro_batch  # as asked, or as found
+        self._found_for: tuple[tuple[int, int], int] | None = None  # (size of the images, the most that were wanted at once)
+        self._ready_for: set[int] = set()  # micro-batches that have been warmed up
+        self.micro_batch = MicroBatch("diffusion inpainting", self._largest, self.device, cure)
 
     def __call__(self, right: Tensor, inpaint_mask: Tensor, generators: Sequence[np.random.Generator]) -> Tensor:
         """`right` with its holes filled.
@@ -127,9 +132,9 @@ class DiffusionInpainter:
         expected = (len(right), *_latent_shape(right))
         if noise.shape != expected:
             raise ValueError(f"noise must be {list(expected)} for images of {list(right.shape)}; got {list(noise.shape)}")
-        if self._to_be_found:
-            self.warm_up((right.shape[-2], right.shape[-1]))
-        made = self.micro_batch.run(lambda part: self._inpaint(right[part], inpaint_mask[part], noise[part]), len(right))
+        if self._auto and not self._is_found((right.shape[-2], right.shape[-1]), len(right)):
+            self._choose((right.shape[-2], right.shape[-1]), len(right))
+        made = self.micro_batch.run(lambda part: self._inpaint(right[part], inpaint_mask[part], noise[part]), len(right), self._rows)
         return torch.cat([right.new_empty(0, *right.shape[1:]), *(part.to(right.device) for part in made)])
 
     def warm_up(self, size: tuple[int, int], samples: int | None = None) -> WarmUp:
@@ -142,23 +147,42 @@ class DiffusionInpainter:
         Raises:
             MemoryError: the device's memory does not suffice for one sample.
         """
-        seconds = 0.0
-        if self._to_be_found:
-            with torch.compiler.set_stance("force_eager"):  # it would compile for every size that is tried
-                self.micro_batch.size, seconds = self._find_micro_batch(size, LARGEST_AUTO if samples is None else samples)
-            self._to_be_found = False
-        if samples is not None:
-            parts = -(-samples // self.micro_batch.size)
-            self.micro_batch.size = -(-samples // parts)  # as many parts, of equal size
-        peak, last = measure(
-            lambda: self.micro_batch.run(lambda part: self._try(part.stop - part.start, size), self.micro_batch.size), self.device
+        seconds = self._choose(size, samples)
+        at_once = self.micro_batch.size
+        peak, last = self.micro_batch.measure(
+            lambda: self.micro_batch.run(lambda part: self._try(part.stop - part.start, size), at_once, self._rows)
         )
         weights = weight_bytes(self._unet, self._autoencoder)
         what = f"inpainting {self.network.name} at {size[0]}x{size[1]}, {self.dtype}"
         return WarmUp(what, self.micro_batch.size, None if peak is None else peak + weights, weights, seconds + last)
 
+    def _choose(self, size: tuple[int, int], samples: int | None) -> float:
+        """Sets the micro-batch for so many samples of this (height, width); the seconds that finding it took.
+
+        It may be asked again, for others: the largest that fits is kept apart from what is used.
+        """
+        seconds = 0.0
+        if self._auto and not self._is_found(size, LARGEST_AUTO if samples is None else samples):
+            self._largest, seconds = self._find_micro_batch(size, LARGEST_AUTO if samples is None else samples)
+        samples = self._largest if samples is None else samples
+        parts = -(-samples // self._largest)
+        self.micro_batch.choose(-(-samples // parts))  # as many parts, of equal size
+        self._ready_for.add(self.micro_batch.size)
+        return seconds
+
+    def _is_found(self, size: tuple[int, int], most: int) -> bool:
+        """Whether the largest micro-batch is known for so many images of this size."""
+        if self._found_for is None:
+            return False
+        largest, wanted = self._found_for
+        fewer = min(most, LARGEST_AUTO) <= wanted or 2 * self._largest <= wanted  # than were tried, or than fit
+        return fewer and size[0] * size[1] <= largest[0] * largest[1]
+
     def _find_micro_batch(self, size: tuple[int, int], most: int) -> tuple[int, float]:
         """The largest micro-batch within the budget, at most `most`, and the seconds that finding it took."""
+        if self._found_for is not None:  # what is found holds for all that was asked before, too
+            size, most = max(size, self._found_for[0], key=math.prod), max(most, self._found_for[1])
+        self._found_for = size, most
         weights = weight_bytes(self._unet, self._autoencoder)
         allowed = self.network.memory_gib
         budget = int(AUTO_SHARE * free_bytes(self.device)) if allowed is None else int(allowed * GIB) - weights
@@ -177,7 +201,14 @@ class DiffusionInpainter:
                 logger.warning("memory_gib=%g cannot be held: one sample and the weights take %.2f GiB", allowed, (weights + peak) / GIB)
             return peak or 0
 
-        return largest_micro_batch(peak_bytes, budget, min(most, LARGEST_AUTO)), spent
+        with torch.compiler.set_stance("force_eager"):  # it would compile for every size that is tried
+            return largest_micro_batch(peak_bytes, budget, min(most, LARGEST_AUTO)), spent
+
+    def _rows(self, count: int) -> int:
+        """How many samples the networks get for `count` of them: compiled ones are not compiled anew for every number."""
+        if not self.network.compile:
+            return count
+        return min((size for size in (*self._ready_for, self.micro_batch.size) if count <= size <= self.micro_batch.size), default=count)
 
     def _try(self, samples: int, size: tuple[int, int]) -> None:
         right = torch.zeros(samples, 3, *size, device=self.device)
@@ -187,8 +218,8 @@ class DiffusionInpainter:
     @torch.no_grad()
     def _inpaint(self, right: Tensor, inpaint_mask: Tensor, noise: Tensor, most_steps: int | None = None) -> Tensor:
         count, (height, width) = len(right), right.shape[-2:]
-        if self.network.compile and count < self.micro_batch.size:  # compiled for one size: another would be compiled anew
-            rows = torch.arange(self.micro_batch.size).clamp(max=count - 1)
+        if self._rows(count) > count:
+            rows = torch.arange(self._rows(count)).clamp(max=count - 1)
             right, inpaint_mask, noise = right[rows], inpaint_mask[rows], noise[rows]
         generators = [torch.Generator().manual_seed(crc32(sample.numpy().tobytes())) for sample in noise.float().cpu()]
         right, inpaint_mask, noise = (tensor.to(self.device) for tensor in (right, inpaint_mask, noise.float()))
@@ -238,6 +269,17 @@ class DiffusionInpainter:
             predicted = self._unet(noisy, timestep_on_device, encoder_hidden_states=prompt).sample.to(torch.float32, copy=True)
             latents = scheduler.step(predicted, timestep, latents, **options).prev_sample
         return latents
+
+
+def checked(network: DiffusionNetwork) -> DiffusionNetwork:
+    """The network at the commit that it stands for; all is checked that can be without loading weights.
+
+    Raises:
+        ImportError, OSError, ValueError: as `DiffusionInpainter`.
+    """
+    network = at_commit(network)
+    make_scheduler(network.scheduler, read_scheduler_config(network), network.steps)
+    return network
 
 
 def latent_mask(inpaint_mask: Tensor) -> Tensor:

@@ -9,12 +9,16 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from huggingface_hub import hf_hub_download
 from safetensors import SafetensorError
 from torch import Tensor
+
+from zsdata.synthesis.inpaint.options import DiffusionNetwork
 
 CELL_PX = 8  # a latent cell is 8x8 pixels in every Stable Diffusion
 LATENT_CHANNELS = 4
@@ -38,20 +42,52 @@ class DiffusionParts(NamedTuple):
     prompt: Tensor  # [1, 2, D]: the empty prompt's embedding, not padded (begin, end), which is what the networks were tuned with
 
 
-def load_diffusion_parts(
-    name: str,
-    subfolder: str = "",
-    revision: str | None = None,
-    autoencoder: str | None = None,
-    dtype: torch.dtype = torch.float32,
-) -> DiffusionParts:
+def read_scheduler_config(network: DiffusionNetwork) -> Mapping[str, Any]:
+    """The scheduler's configuration, of what is an inpainting pipeline as far as its other configurations tell; no weights are loaded.
+
+    Raises:
+        ImportError, OSError, ValueError: as `load_diffusion_parts`.
+    """
+    try:
+        from diffusers import DDIMScheduler, UNet2DConditionModel  # pyright: ignore[reportPrivateImportUsage]
+        from transformers import CLIPTextModel  # noqa: F401
+    except ImportError as error:
+        raise ImportError(f'inpaint="{network.name}" needs diffusers and transformers: pip install "zsdata[diffusion]"') from error
+    _check_folder(network)
+    place = network.name, network.subfolder
+    config: Any = _load(DDIMScheduler.load_config, *place, "scheduler", network.revision)
+    _check_unet(network.name, _load(UNet2DConditionModel.load_config, *place, "unet", network.revision))
+    return config
+
+
+def at_commit(network: DiffusionNetwork) -> DiffusionNetwork:
+    """The network at the commits that its Hub ids stand for now: what moves on the Hub later changes no run that goes on.
+
+    Raises:
+        FileNotFoundError, OSError, ValueError: there is no such folder, or the Hub does not have it, or cannot be reached and the local
+            cache does not have it either.
+    """
+    _check_folder(network)
+    revision, autoencoder_revision = network.revision, network.autoencoder_revision
+    if not os.path.isdir(network.name):
+        revision = _load(_commit, network.name, network.subfolder, "scheduler", revision, file="scheduler_config.json")
+    if network.autoencoder is not None and not os.path.isdir(network.autoencoder):
+        autoencoder_revision = _load(_commit, network.autoencoder, "", "", autoencoder_revision, file="config.json")
+    return replace(network, revision=revision, autoencoder_revision=autoencoder_revision)
+
+
+def _commit(name: str, revision: str | None, file: str, subfolder: str = "") -> str:
+    """`file` is a small one: the Hub says its commit with it."""
+    path = f"{subfolder}/{file}".lstrip("/")
+    return Path(hf_hub_download(name, path, revision=revision)).parents[path.count("/")].name
+
+
+def load_diffusion_parts(network: DiffusionNetwork, dtype: torch.dtype = torch.float32) -> DiffusionParts:
     """Loads U-Net, autoencoder and scheduler configuration; embeds the empty prompt and drops the text encoder.
 
     Args:
-        name: a Hub id ("owner/name") or a local folder that holds unet/, vae/, text_encoder/, tokenizer/ and scheduler/.
-        subfolder: where in it the pipeline lies; "" is its root.
-        revision: branch, tag or commit of a Hub id.
-        autoencoder: a Hub id or folder of another autoencoder (`AutoencoderKL` or `AutoencoderTiny`) to use in place of vae/.
+        network: its name holds unet/, vae/, text_encoder/, tokenizer/ and scheduler/; its autoencoder, `AutoencoderKL` or
+            `AutoencoderTiny`, is used in place of vae/.
         dtype: of the U-Net, the autoencoder and the prompt; the prompt is computed in float32.
 
     Raises:
@@ -59,25 +95,18 @@ def load_diffusion_parts(
         FileNotFoundError, OSError: the folder, a part of it or its safetensors weights are missing or damaged.
         ValueError: the parts are not those of an inpainting pipeline, or weights are incomplete.
     """
-    try:
-        from diffusers import (  # pyright: ignore[reportPrivateImportUsage]
-            AutoencoderKL,  # pyright: ignore[reportPrivateImportUsage]
-            AutoencoderTiny,  # pyright: ignore[reportPrivateImportUsage]
-            DDIMScheduler,  # pyright: ignore[reportPrivateImportUsage]
-            UNet2DConditionModel,  # pyright: ignore[reportPrivateImportUsage]
-        )
-        from transformers import CLIPTextModel, CLIPTokenizerFast  # pyright: ignore[reportAttributeAccessIssue]
-    except ImportError as error:
-        raise ImportError(f'inpaint="{name}" needs diffusers and transformers: pip install "zsdata[diffusion]"') from error
-    _check_folder(name, subfolder, revision, autoencoder)
+    scheduler_config = read_scheduler_config(network)
+    from diffusers import (  # pyright: ignore[reportPrivateImportUsage]
+        AutoencoderKL,  # pyright: ignore[reportPrivateImportUsage]
+        AutoencoderTiny,  # pyright: ignore[reportPrivateImportUsage]
+        UNet2DConditionModel,  # pyright: ignore[reportPrivateImportUsage]
+    )
+    from transformers import CLIPTextModel, CLIPTokenizerFast  # pyright: ignore[reportAttributeAccessIssue]
 
-    scheduler_config: Any = _load(DDIMScheduler.load_config, name, subfolder, "scheduler", revision)
-
-    unet_config: Any = _load(UNet2DConditionModel.load_config, name, subfolder, "unet", revision)
-    _check_unet(name, unet_config)
+    name, subfolder, revision, autoencoder = network.name, network.subfolder, network.revision, network.autoencoder
     unet = _load_weights(UNet2DConditionModel, name, subfolder, "unet", revision, torch_dtype=dtype)
 
-    autoencoder_place = (name, subfolder, "vae", revision) if autoencoder is None else (autoencoder, "", "", None)
+    autoencoder_place = (name, subfolder, "vae", revision) if autoencoder is None else (autoencoder, "", "", network.autoencoder_revision)
     autoencoders = {"AutoencoderKL": AutoencoderKL, "AutoencoderTiny": AutoencoderTiny}
     autoencoder_config: Any = _load(AutoencoderKL.load_config, *autoencoder_place)
     kind = autoencoder_config.get("_class_name")
@@ -173,10 +202,15 @@ def _check_unet(name: str, config: Mapping[str, Any]) -> None:
         )
 
 
-def _check_folder(name: str, subfolder: str, revision: str | None, autoencoder: str | None) -> None:
+def _check_folder(network: DiffusionNetwork) -> None:
     """Says what a local folder lacks, before a library asks the Hub for it."""
-    if revision is not None and os.path.isdir(name):
-        raise ValueError(f'inpaint="{name}" is a folder, which has no revisions; got revision="{revision}": leave it out')
+    name, subfolder, autoencoder = network.name, network.subfolder, network.autoencoder
+    for place, revision, argument in (
+        (name, network.revision, "revision"),
+        (autoencoder, network.autoencoder_revision, "autoencoder_revision"),
+    ):
+        if place is not None and revision is not None and os.path.isdir(place):
+            raise ValueError(f'"{place}" is a folder, which has no revisions; got {argument}="{revision}": leave it out')
     for place in filter(None, (name, autoencoder)):
         if not os.path.isdir(place) and not re.fullmatch(r"[\w.-]+/[\w.-]+", place):
             raise FileNotFoundError(f'"{place}" is neither a folder nor a Hub id ("owner/name")')

@@ -25,6 +25,7 @@ class DiffusionNetwork:
         subfolder: where in the repository or folder the pipeline lies: "StereoGen" in the paper's "Windsrain/ZeroStereo".
         revision: branch, tag or commit of a Hub id.
         autoencoder: a Hub id or folder of another autoencoder in the same latent space, such as the tiny "madebyollin/taesd".
+        autoencoder_revision: branch, tag or commit of that Hub id.
         dtype: of the networks: "float32", "bf16" or "fp16". None is float32 on the CPU; on CUDA bf16 where the GPU has it, else fp16. The
             denoised latent itself is kept in float32.
         compile: whether the networks go through `torch.compile`; or its mode, of which "reduce-overhead" uses CUDA graphs.
@@ -42,6 +43,7 @@ class DiffusionNetwork:
     subfolder: str = ""
     revision: str | None = None
     autoencoder: str | None = None
+    autoencoder_revision: str | None = None
     dtype: str | None = None
     compile: bool | str = False
     micro_batch: int | Literal["auto"] = "auto"
@@ -49,6 +51,8 @@ class DiffusionNetwork:
 
     def __post_init__(self) -> None:
         check_types(self)
+        if self.autoencoder is None and self.autoencoder_revision is not None:
+            raise ValueError(f"autoencoder_revision belongs to an autoencoder, and none is named; got {self.autoencoder_revision!r}")
         if self.steps < 1:
             raise ValueError(f"steps is 1 or more; got {self.steps}")
         if self.micro_batch != "auto" and (isinstance(self.micro_batch, str) or self.micro_batch < 1):

@@ -53,13 +53,13 @@ def make_scheduler(name: str, config: Mapping[str, Any], steps: int) -> Any:
             'take "EulerAncestralDiscreteScheduler" for one that adds noise'
         )
     _check_noise_schedule(config)
-    # Latents are not bounded by -1..1, but some schedulers clip to it unless told otherwise.
+    # Latents are not bounded by -1..1; but schedulers that were made with no word of it say that they clip to that.
     unclipped = {"clip_sample": False} if "clip_sample" in options else {}
     said = ""
     for spacing in ({}, {"timestep_spacing": "trailing"}):
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="__array", category=DeprecationWarning)  # what diffusers does to NumPy 2
-            scheduler = scheduler_class.from_config({**unclipped, **config, **spacing})
+            scheduler = scheduler_class.from_config({**config, **unclipped, **spacing})
             try:
                 scheduler.set_timesteps(steps)
             except (ValueError, IndexError) as error:
