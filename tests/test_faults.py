@@ -32,6 +32,14 @@ def test_both_the_count_and_the_rate_must_be_exceeded():
     assert batches_until_spent(FaultLog(FailureBudget(count=0, rate=0)), 1, 100) == 1
 
 
+def test_what_is_forgiven_is_counted_and_spends_nothing():
+    log = FaultLog(FailureBudget(count=0, rate=0), forgiven=["sparse truth"])
+    log.add(1, [reject(0, "sparse truth: 24 %"), reject(1, "sparse truth: 3 %")])
+    assert log.by_reason == {"sparse truth": 2}
+    with pytest.raises(TooManyFaults, match="1 of the last 5 photos were refused"):
+        log.add(1, [reject(2)])
+
+
 def test_a_bucket_that_breaks_after_a_good_week_is_noticed_soon():
     fresh, old = (FaultLog(FailureBudget(count=100, rate=0.1)) for _ in range(2))
     for _ in range(10 * RECENT_PHOTOS // 8):

@@ -6,7 +6,8 @@ accelerate launch trainers/inpaint.py --pipeline sd2-community/stable-diffusion-
     --datasets sceneflow-final=data/sceneflow tartanair=data/tartanair crestereo=data/crestereo vkitti2=data/vkitti2 --output runs/inpaint
 
 The result is a pipeline in the diffusers format, RUN/checkpoints/step-.../pipeline, for `ZeroStereoStream(inpaint=that folder)` or
-`trainers/raft.py --inpaint that folder`.
+`trainers/raft.py --inpaint that folder`. The last three checkpoints stay; of a run that judges them (--validate) the best one, too, in
+RUN/best/pipeline.
 
 The defaults are the paper's: the VAE is frozen, the U-Net learns to predict the noise; 50,000 steps of 32 crops of 512x512; AdamW, a
 one-cycle of 2e-5; the same colour augmentation for both images. --batch-size counts all ranks, and what does not fit at once is
@@ -18,7 +19,8 @@ Where the examples come from
   --datasets     synthetic stereo with true disparity, warped left to right, in the folders that their authors publish:
 {layouts}
                  The folder may be the data set's own or one above it. Where the right view's truth is there too, half of the pairs are
-                 mirrored. Several data sets, and photos beside them, are mixed by their numbers of pairs.
+                 mirrored. A pair of sparse truth, of which less than half is known, is refused. Several data sets, and photos beside them,
+                 are mixed by their numbers of pairs.
   --datasets tars=URL   the same in WebDataset tars: KEY.left.png (or jpg, webp), KEY.right.png, KEY.disp.pfm (or .npy in pixels, or
                  .png of 16 bits, 256 times the disparity), optionally KEY.disp_right.*.
 
@@ -40,7 +42,7 @@ from trainers.inpaint_data.tars import StereoTars
 from trainers.inpaint_loop import TuneConfig, tune
 from trainers.pairs_on_disk import StereoPair, find_pairs, motorcycle, read_pair
 from trainers.pipeline_folder import local_pipeline
-from zsdata import AdaptiveDisparity
+from zsdata import AdaptiveDisparity, DepthNetwork
 from zsdata.source.manifest import build_manifest
 
 TARS = "tars"
@@ -92,8 +94,13 @@ def open_sources(arguments: argparse.Namespace) -> dict[str, Source]:
         if kind in sources:
             raise ValueError(f"{kind} is named twice; put both below one folder, or give a pattern of tars")
         sources[kind] = StereoSource(StereoTars(where) if kind == TARS else StereoFolder(kind, where))
+    depth = arguments.depth
+    if arguments.depth_revision is not None:
+        if depth in ("builtin", "stored"):
+            raise ValueError(f"--depth-revision belongs to a depth network of the Hub; --depth is {depth}")
+        depth = DepthNetwork(depth, revision=arguments.depth_revision)
     if arguments.photos:
-        sources["photos"] = PhotoSource(build_manifest(arguments.photos), arguments.depth, AdaptiveDisparity(), arguments.depth_cache)
+        sources["photos"] = PhotoSource(build_manifest(arguments.photos), depth, AdaptiveDisparity(), arguments.depth_cache)
     elif arguments.depth_cache is not None:
         raise ValueError("--depth-cache keeps the depth of photos; name --photos, or leave it out")
     if not sources:
@@ -130,6 +137,7 @@ def _parser() -> argparse.ArgumentParser:
         help='for photos: "builtin", a Hub id or folder in the transformers format, or "stored", the maps beside them in the tars, where '
         "`zsdata pack` puts NAME.depth.npy or NAME.depth.png with NAME.jpg (default: builtin)",
     )
+    data.add_argument("--depth-revision", metavar="REV", help="branch, tag or commit of a Hub id")
     data.add_argument(
         "--depth-cache",
         metavar="DIR",
@@ -168,7 +176,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     training.add_argument("--mixed-precision", choices=("no", "bf16", "fp16"), help="default: what `accelerate launch` was told")
     training.add_argument(
-        "--output", type=Path, required=True, metavar="DIR", help="the run's own folder: checkpoints, logs, validation.jsonl"
+        "--output", type=Path, required=True, metavar="DIR", help="the run's own folder: checkpoints, best, logs, validation.jsonl"
     )
     training.add_argument(
         "--resume", type=Path, metavar="DIR", help="go on from the newest checkpoint of that run, or from that checkpoint"
@@ -178,13 +186,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     training.add_argument("--tracker", default="tensorboard", help='one of Accelerate\'s trackers, or "none" (default: tensorboard)')
 
-    validation = parser.add_argument_group("the validation, before the first step and at every checkpoint")
+    validation = parser.add_argument_group("the validation, before the first step, at every checkpoint and on resume")
     validation.add_argument(
         "--validate",
         nargs="+",
         default=[],
         metavar="WHAT",
-        help='"motorcycle" (ships with scikit-image), or folders of real pairs with dense ground truth: PSNR and SSIM in their holes',
+        help='"motorcycle" (ships with scikit-image), or folders of real pairs with dense ground truth: PSNR and SSIM in their holes; the '
+        "checkpoint of the highest mean PSNR is kept in RUN/best",
     )
     validation.add_argument(
         "--validation-steps", type=int, default=defaults.validation_steps, help=f"of DDIM (default: {defaults.validation_steps})"

@@ -1,6 +1,8 @@
 """The fine-tuning of an inpainting U-Net on warped views (paper, section "Fine-tuning Protocol"): only the U-Net learns, to predict noise.
 
-A checkpoint is RUN/checkpoints/step-.../ with pipeline/, a whole pipeline in the diffusers format, training.pt and state.json.
+A checkpoint is RUN/checkpoints/step-.../ with pipeline/, a whole pipeline in the diffusers format, training.pt and state.json. The last few
+stay, and in RUN/best/ the best. A checkpoint is judged after it is saved, so its state.json tells the best of those before it; a run that
+is resumed begins by judging the one that it goes on from.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from trainers.accelerated import load_optimizer_state, open_accelerator, optimiz
 from trainers.hole_scores import HoleCase, hole_cases, mean_hole_scores, score_holes
 from trainers.inpaint_data.batches import making, requests
 from trainers.inpaint_data.sources import ExampleBatch, Examples
+from trainers.inpaint_data.stored_maps import SPARSE_TRUTH
 from trainers.memory import out_of_memory_is_cured_by
 from trainers.noise_prediction import NoisePrediction
 from trainers.pairs_on_disk import StereoPair
@@ -33,6 +36,7 @@ from zsdata.position import Position, require_one_place
 from zsdata.progress import Progress
 from zsdata.synthesis.inpaint import load_inpainter
 from zsdata.synthesis.inpaint.diffusion_parts import CELL_PX, load_diffusion_parts
+from zsdata.synthesis.inpaint.options import DiffusionNetwork
 
 MODEL = "an inpainting U-Net"
 PIPELINE = "pipeline"  # the folder in a checkpoint
@@ -100,12 +104,13 @@ def tune(
     Args:
         pipeline: a local folder in the diffusers format, or one that holds it, with the card and the licence.
         examples: made for `config.seed` and `config.batch_size`.
-        output: the run's folder: checkpoints, tracker logs, log.jsonl, skipped.jsonl, validation.jsonl. Refused where it holds those of
-            another run.
+        output: the run's folder: checkpoints, best, tracker logs, log.jsonl, skipped.jsonl, validation.jsonl. Refused where it holds
+            those of another run.
         arguments: what the run was started with, saved with its state.
         subfolder: where in `pipeline` it lies.
         resume: a run's folder or one of its checkpoints.
-        pairs: stereo pairs with dense ground truth; their holes are filled and judged before the first step and at every checkpoint.
+        pairs: stereo pairs with dense ground truth; their holes are filled and judged before the first step, at every checkpoint and on
+            resume. The checkpoint of the highest mean PSNR is kept in OUTPUT/best.
         tracker: any of Accelerate's, or None.
 
     Raises:
@@ -120,13 +125,15 @@ def tune(
     accumulate = accelerator.gradient_accumulation_steps = config.accumulate(accelerator.num_processes)
     if any(side <= 0 or side % CELL_PX for side in examples.size):
         raise ValueError(f"crops are multiples of {CELL_PX} px high and wide, {CELL_PX} or more; got {examples.size}")
-    parts = load_diffusion_parts(str(pipeline), subfolder)
+    parts = load_diffusion_parts(DiffusionNetwork(str(pipeline), subfolder=subfolder))
     prediction = NoisePrediction(parts, accelerator.device, config.seed)
     cases = _validation_cases(pairs, examples, accelerator)
+    judged_by = {"pairs": [case.name for case in cases], "validation_steps": config.validation_steps}
 
     kept = {name: getattr(config, name) for name in ("steps", "learning_rate", "weight_decay", "ema")}
     options = {"model": MODEL, **kept, "the pipeline's digest": frozen_digest(pipeline / subfolder)}
     unet, step, training, state, refused_before = parts.unet, 0, None, {}, Counter[str]()
+    checkpoint: Path | None = None
     if resume is not None:
         checkpoint = run_folder.newest(resume)
         training, state = run_folder.load(checkpoint)
@@ -162,10 +169,15 @@ def tune(
         average.to(accelerator.device)
 
     output.mkdir(parents=True, exist_ok=True)
+    best: dict[str, Any] | None = state.get("best")  # {"step", "psnr", "by"}, of the checkpoints before this one
+    if checkpoint is not None and best is not None and accelerator.is_main_process:
+        there = run_folder.restore_best(checkpoint, output, best["step"])
+        if cases and not (there and best["by"] == judged_by):
+            best = None
     if tracker is not None:
         accelerator.init_trackers(output.name or "run", {name: value for name, value in asdict(config).items() if value is not None})
 
-    faults = FaultLog(FailureBudget(), ranks=accelerator.num_processes)
+    faults = FaultLog(FailureBudget(), ranks=accelerator.num_processes, forgiven=[SPARSE_TRUTH])
 
     def refused() -> dict[str, int]:
         """Pairs and photos that could not be used, by reason, of all ranks and since the run began."""
@@ -184,26 +196,32 @@ def tune(
                         "examples": examples.position(step).to_state(),
                         "options": options,
                         "refused": refused_so_far,
+                        "best": best,
                         "guard": guard.state_dict(),
                         "world_size": accelerator.num_processes,
                         "arguments": arguments,
                     },
                 )
         accelerator.wait_for_everyone()
-        return run_folder.folder_of(output, step) / PIPELINE
+        return run_folder.folder_of(output, step)
 
-    def validate(folder: Path) -> None:
-        if cases:
-            scores = _validate(folder, cases, config, accelerator)
-            mean = mean_hole_scores(scores)
-            accelerator.log({f"hole_{name}": value for name, value in mean.items()}, step=step)
-            accelerator.print(f"step {step}: holes of {len(scores)} pairs, PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.3f}")
+    def validate(checkpoint: Path | None) -> None:
+        """Judges a checkpoint, which is kept if it is the best so far; or, with None, the pipeline that the run begins with."""
+        nonlocal best
+        if not cases:
+            return
+        scores = _validate(pipeline / subfolder if checkpoint is None else checkpoint / PIPELINE, cases, config, accelerator)
+        mean, note = mean_hole_scores(scores), ""
+        if checkpoint is not None and mean["psnr"] > (-math.inf if best is None else best["psnr"]):
+            best, note = {"step": step, "psnr": mean["psnr"], "by": judged_by}, ", the best so far"
             if accelerator.is_main_process:
-                run_folder.append(output / "validation.jsonl", {"step": step, "mean": mean, "pairs": scores})
+                run_folder.keep_best(checkpoint, output)
+        accelerator.log({f"hole_{name}": value for name, value in mean.items()}, step=step)
+        accelerator.print(f"step {step}: holes of {len(scores)} pairs, PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.3f}{note}")
+        if accelerator.is_main_process:
+            run_folder.append(output / "validation.jsonl", {"step": step, "mean": mean, "pairs": scores})
 
-    saved = output
-    if training is None:
-        validate(pipeline / subfolder)
+    validate(checkpoint)
     asked = requests(step, config.steps, config.batch_size, config.micro_batch, accelerator.process_index, accelerator.num_processes)
     progress = Progress(total=config.steps, initial=step, unit="step", disable=not accelerator.is_main_process, dynamic_ncols=True)
     with making(examples, asked, config.workers, accelerator.device) as batches:
@@ -251,12 +269,14 @@ def tune(
                     run_folder.append(output / "log.jsonl", {"step": step, **values, "refused": reasons})
                 accelerator.log({**values, "refused": sum(reasons.values())}, step=step)
             if step % config.save_every == 0 or step == config.steps:
-                saved = save()
-                validate(saved)
+                validate(save())
     progress.close()
     accelerator.print(_summary(refused()))
+    if cases and best is not None:
+        where = output / "best" / PIPELINE
+        accelerator.print(f"the best pipeline is {where}, of step {best['step']}: PSNR {best['psnr']:.2f} dB in the holes")
     accelerator.end_training()
-    return saved
+    return run_folder.folder_of(output, step) / PIPELINE
 
 
 def _validation_cases(pairs: list[StereoPair] | None, examples: Examples, accelerator: Accelerator) -> list[HoleCase]:

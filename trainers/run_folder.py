@@ -108,7 +108,7 @@ def restore_best(checkpoint: Path, output: Path, step: int) -> bool:
     The run may have stopped before it was copied, or be resumed into another folder. False where that checkpoint is no longer there.
     """
     best = output / "best"
-    for folder in (best, checkpoint, checkpoint.parent.parent / "best"):
+    for folder in (best, checkpoint, checkpoint.with_name(folder_of(output, step).name), checkpoint.parent.parent / "best"):
         if (folder / "state.json").is_file() and json.loads((folder / "state.json").read_text())["step"] == step:
             if folder != best:
                 keep_best(folder, output)

@@ -85,14 +85,16 @@ class FaultLog:
 
     Args:
         ranks: that share the budget's count.
+        forgiven: reasons that are counted and spend no budget: what they tell belongs to the data, and is no failure.
     """
 
     EXAMPLES = 20  # kept for the summary
     LOG_LINES = 20  # at most, one for each reason
 
-    def __init__(self, budget: FailureBudget, ranks: int = 1) -> None:
+    def __init__(self, budget: FailureBudget, ranks: int = 1, forgiven: Sequence[str] = ()) -> None:
         self._budget = budget
         self._ranks = ranks
+        self._forgiven = tuple(forgiven)
         self._recent: deque[tuple[int, int]] = deque()  # (tried, refused)
         self._tried = self._refused = 0
         self.made = 0
@@ -108,10 +110,10 @@ class FaultLog:
         self.made += made
         for reject in rejected:
             self._count(reject)
-        self._spend(made + len(rejected), len(rejected))
+        self._spend(made + len(rejected), sum(_reason(reject) not in self._forgiven for reject in rejected))
 
     def _count(self, reject: tuple[str, str, str, str]) -> None:
-        reason = reject[3].split(":")[0]
+        reason = _reason(reject)
         if reason not in self.by_reason:
             if len(self.by_reason) < self.LOG_LINES:
                 logger.warning('photo "%s" in %s skipped: %s (further ones of this kind are only counted)', reject[2], reject[1], reject[3])
@@ -140,3 +142,8 @@ class FaultLog:
                 f"({self._budget.count}{ranks}, and {self._budget.rate:.0%}). Refused since the start: {reasons}; the first: {examples}. "
                 "`zsdata verify` lists what is wrong with the shards"
             )
+
+
+def _reason(reject: tuple[str, str, str, str]) -> str:
+    """What it is counted by: without the detail."""
+    return reject[3].split(":")[0]

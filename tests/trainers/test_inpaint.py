@@ -31,9 +31,10 @@ from trainers.pipeline_folder import local_pipeline
 from trainers.step_guard import MOST_SKIPPED_IN_A_ROW, TrainingDiverged
 from trainers.weight_average import WeightAverage, weights_of
 from zsdata import AdaptiveDisparity, ZeroStereoStream, load_inpainter
-from zsdata.faults import FaultLog
+from zsdata.faults import FailureBudget, FaultLog, TooManyFaults
 from zsdata.source.manifest import build_manifest
 from zsdata.synthesis.inpaint.diffusion_parts import load_diffusion_parts
+from zsdata.synthesis.inpaint.options import DiffusionNetwork
 
 diffusers = pytest.importorskip("diffusers")
 transformers = pytest.importorskip("transformers")
@@ -116,7 +117,7 @@ def weights(folder):
 
 def loss_of(folder, examples, first_step=1000):
     """On examples, noise and timesteps that no training here has seen."""
-    parts = load_diffusion_parts(str(folder))
+    parts = load_diffusion_parts(DiffusionNetwork(str(folder)))
     batch = ExampleBatch.stack([examples[first_step, index] for index in range(32)])
     with torch.no_grad():
         return NoisePrediction(parts, torch.device("cpu"), seed=0).loss(parts.unet, batch).item()
@@ -156,7 +157,7 @@ def test_the_unet_is_asked_as_the_inpainter_asks_it(pipeline, photos):
 
     examples = examples_of(photos=photos)
     batch = ExampleBatch.stack([examples[0, index] for index in range(4)])
-    parts = load_diffusion_parts(str(pipeline))
+    parts = load_diffusion_parts(DiffusionNetwork(str(pipeline)))
     prediction = NoisePrediction(parts, torch.device("cpu"), seed=0)
     loss = prediction.loss(unet, batch)
     noise, timesteps = prediction._draw(batch)
@@ -178,7 +179,7 @@ def test_the_unet_is_asked_as_the_inpainter_asks_it(pipeline, photos):
 
 def test_noise_and_timesteps_belong_to_the_example(pipeline, photos):
     examples = examples_of(photos=photos)
-    prediction = NoisePrediction(load_diffusion_parts(str(pipeline)), torch.device("cpu"), seed=0)
+    prediction = NoisePrediction(load_diffusion_parts(DiffusionNetwork(str(pipeline))), torch.device("cpu"), seed=0)
     noise, timesteps = prediction._draw(ExampleBatch.stack([examples[s, i] for s in range(10) for i in range(4)]))
     alone = prediction._draw(examples[2, 3])
     assert torch.equal(alone[0][0], noise[11]) and alone[1][0] == timesteps[11]
@@ -231,9 +232,24 @@ def test_what_is_refused_is_counted_by_reason_over_ranks_and_resumes(pipeline, t
     half = tmp_path / "run" / "checkpoints" / "step-00000002"
     assert json.loads((half / "state.json").read_text())["refused"] == {"no file": 2}
     logs = []
-    monkeypatch.setattr(inpaint_loop, "FaultLog", lambda budget, ranks: logs.append(ranks) or FaultLog(budget, ranks))
+    monkeypatch.setattr(inpaint_loop, "FaultLog", lambda budget, ranks, **more: logs.append(ranks) or FaultLog(budget, ranks, **more))
     saved = run(pipeline, examples_of(things=broken), tmp_path / "resumed", config(steps=4), resume=half)
     assert json.loads((saved.parent / "state.json").read_text())["refused"] == {"no file": 4} and logs == [1]
+
+
+def test_pairs_of_sparse_truth_are_replaced_and_counted_and_stop_no_run(pipeline, things, tmp_path, monkeypatch, capsys):
+    """As outdoor scenes of Falling Things have it; a missing file is another matter."""
+    sparse, broken = (shutil.copytree(things, tmp_path / name) for name in ("sparse", "broken"))
+    for number in (1, 2):
+        truth = np.full((72, 96), np.inf, np.float32)
+        truth[:20] = 4
+        (sparse / "disparity" / "TRAIN" / "A" / "0000" / "left" / f"{number:04d}.pfm").write_bytes(pfm(truth))
+        (broken / "frames_cleanpass" / "TRAIN" / "A" / "0000" / "right" / f"{number:04d}.png").unlink()
+    monkeypatch.setattr(inpaint_loop, "FailureBudget", lambda: FailureBudget(count=0, rate=0.1))
+    run(pipeline, examples_of(things=sparse), tmp_path / "run", config(steps=2, save_every=2))
+    assert "refused, and replaced by others: sparse truth: " in capsys.readouterr().out
+    with pytest.raises(TooManyFaults, match="no file"):
+        run(pipeline, examples_of(things=broken), tmp_path / "stopped", config(steps=2, save_every=2))
 
 
 def test_faults_in_the_tars_of_photos_are_told(photos, tmp_path, caplog):
@@ -335,6 +351,88 @@ def test_real_pairs_are_judged_before_and_at_every_checkpoint(pipeline, photos, 
     assert "not judged, for want of dense ground truth or of holes: sparse" in printed and "step 4: holes of 2 pairs, PSNR" in printed
     logged = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert logged[-1]["step"] == 4 and {"loss", "learning_rate", "examples_per_second", "wait_share"} < logged[-1].keys()
+
+
+def step_of(folder):
+    return json.loads((folder / "state.json").read_text())["step"]
+
+
+def judged_as(monkeypatch, psnr, cut_at=None):
+    """The pipelines of steps 0, 1, ... are as good as `psnr` says. The power is cut while that of step `cut_at` is judged."""
+
+    def score_holes(folder, case, number, seed):
+        step = step_of(folder.parent) if folder.name == inpaint_loop.PIPELINE else 0
+        if step == cut_at:
+            raise RuntimeError("power cut")
+        return {"name": case.name, "pixels": 1, "psnr": float(psnr[step]), "ssim": 0.5}
+
+    monkeypatch.setattr(inpaint_loop, "load_inpainter", lambda folder, *arguments, **options: folder)
+    monkeypatch.setattr(inpaint_loop, "score_holes", score_holes)
+
+
+def best_of(output):
+    """What the last checkpoint says of the best one."""
+    return json.loads((run_folder.newest(output) / "state.json").read_text())["best"]
+
+
+def test_the_best_checkpoint_outlives_those_that_are_removed(pipeline, photos, tmp_path, monkeypatch, capsys):
+    judged_as(monkeypatch, [30, 12, 15, 14, 15, 13, 11])
+    saved = run(pipeline, examples_of(photos=photos), tmp_path, config(steps=6, save_every=1), pairs=[real_pair()])
+    assert [path.name[-1] for path in sorted(saved.parent.parent.iterdir())] == ["4", "5", "6"]
+    assert step_of(tmp_path / "best") == 2, "the first of equals, and never the pipeline that the run began with"
+    assert best_of(tmp_path) == {"step": 2, "psnr": 15.0, "by": {"pairs": ["pair 0"], "validation_steps": 2}}
+    assert not all(torch.equal(weight, weights(saved)[name]) for name, weight in weights(tmp_path / "best" / "pipeline").items())
+    assert load_inpainter(tmp_path / "best" / "pipeline", steps=1).steps == 1
+    printed = capsys.readouterr().out
+    assert "step 2: holes of 1 pairs, PSNR 15.00 dB, SSIM 0.500, the best so far" in printed and printed.count("the best so far") == 2
+    assert f"the best pipeline is {tmp_path / 'best' / 'pipeline'}, of step 2: PSNR 15.00 dB" in printed
+
+
+def test_without_pairs_to_judge_by_nothing_is_called_the_best(pipeline, photos, tmp_path, capsys):
+    run(pipeline, examples_of(photos=photos), tmp_path, config(steps=1))
+    assert not (tmp_path / "best").exists() and best_of(tmp_path) is None and "best" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("output", ["broken", "elsewhere"])
+@pytest.mark.parametrize(("cut_at", "copying"), [(2, False), (3, False), (None, True)])
+def test_a_resumed_run_knows_the_best(pipeline, photos, tmp_path, monkeypatch, output, cut_at, copying):
+    """Also one that ended before its best checkpoint was judged, or before it was copied."""
+    examples, settings, options = examples_of(photos=photos), config(steps=5, save_every=1), {"pairs": [real_pair()]}
+    keep_best = run_folder.keep_best
+
+    def keep_the_first(checkpoint, output):
+        if copying and step_of(checkpoint) == 2:
+            raise RuntimeError("power cut")
+        return keep_best(checkpoint, output)
+
+    psnr = [9, 12, 15, 14, 13, 14]
+    judged_as(monkeypatch, psnr, cut_at)
+    with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="power cut"):
+        patch.setattr(run_folder, "keep_best", keep_the_first)
+        run(pipeline, examples, tmp_path / "broken", settings, **options)
+    judged_as(monkeypatch, psnr)
+    run(pipeline, examples, tmp_path / output, settings, resume=tmp_path / "broken", **options)
+    assert step_of(tmp_path / output / "best") == best_of(tmp_path / output)["step"] == 2
+
+
+def test_a_best_that_is_lost_or_was_told_by_other_pairs_is_forgotten(pipeline, photos, tmp_path, monkeypatch):
+    examples, settings = examples_of(photos=photos), config(steps=4, save_every=1)
+    judged_as(monkeypatch, [9, 15, 12, 10, 10], cut_at=4)
+    with pytest.raises(RuntimeError, match="power cut"):
+        run(pipeline, examples, tmp_path / "run", settings, pairs=[real_pair()])
+    (half,) = (tmp_path / "run" / "checkpoints").glob("step-*3")
+    assert step_of(tmp_path / "run" / "best") == 1
+    judged_as(monkeypatch, [9, 15, 12, 11, 10])
+    for name, others in {"other pairs": {"pairs": [real_pair(1)._replace(name="other")]}, "kept": {}}.items():
+        run(pipeline, examples, tmp_path / name, settings, resume=half, **others)
+    assert step_of(tmp_path / "other pairs" / "best") == best_of(tmp_path / "other pairs")["step"] == 3
+    assert step_of(tmp_path / "kept" / "best") == best_of(tmp_path / "kept")["step"] == 1, "a run that judges nothing passes it on"
+    shutil.move(tmp_path / "run" / "best", half.with_name("step-00000001"))
+    run(pipeline, examples, tmp_path / "found", settings, resume=half, pairs=[real_pair()])
+    assert step_of(tmp_path / "found" / "best") == 1, "it still lies among the checkpoints"
+    shutil.rmtree(half.with_name("step-00000001"))
+    run(pipeline, examples, tmp_path / "lost", settings, resume=half, pairs=[real_pair()])
+    assert step_of(tmp_path / "lost" / "best") == best_of(tmp_path / "lost")["step"] == 3
 
 
 def test_hole_scores_are_psnr_and_ssim_over_the_holes():
@@ -603,6 +701,7 @@ def test_the_command_tunes_on_two_ranks_as_on_one(pipeline, photos, things, tmp_
     assert [row["step"] for row in rows[0]] == [row["step"] for row in rows[1]] == [0, 2]
     assert rows[0][0]["mean"] == pytest.approx(rows[1][0]["mean"], rel=1e-4)
     assert re.search(r"the pipeline is .*two/checkpoints/step-00000002/pipeline", two.stdout)
+    assert "the best pipeline is" in two.stdout and step_of(tmp_path / "two" / "best") == 2
 
 
 @pytest.mark.parametrize(
@@ -612,6 +711,10 @@ def test_the_command_tunes_on_two_ranks_as_on_one(pipeline, photos, things, tmp_
         ([], "nothing to learn from: name --photos or --datasets"),
         (["--photos", "nowhere.tar"], "nowhere.tar"),
         (["--depth-cache", "depth"], "--depth-cache keeps the depth of photos; name --photos, or leave it out"),
+        (
+            ["--photos", "photos.tar", "--depth-revision", "v1"],
+            "--depth-revision belongs to a depth network of the Hub; --depth is builtin",
+        ),
         (["--datasets", "kitti=somewhere"], "takes KIND=FOLDER with one of sceneflow-clean"),
         (["--datasets", "tartanair=nowhere"], "no folder nowhere"),
         (["--datasets", "vkitti2=tests", "--pipeline", "nowhere"], "no pair of vkitti2 in tests"),
@@ -639,5 +742,6 @@ def test_help_names_every_data_set_and_the_tar_layout(monkeypatch, capsys):
         "KEY.disp.pfm",
         "sd2-community",
         "StereoGen",
+        "RUN/best/pipeline",
     ):
         assert word in text

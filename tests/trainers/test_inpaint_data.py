@@ -10,12 +10,14 @@ import pytest
 
 from tests.scenes import SHARED, photo, write_tar
 from trainers.inpaint_data.layouts import LAYOUTS, StereoFolder
-from trainers.inpaint_data.stored_maps import decode_map
+from trainers.inpaint_data.stored_maps import StereoFrame, decode_map
 from trainers.inpaint_data.tars import StereoTars
+from trainers.pairs_on_disk import find_pairs, read_pair
 from zsdata.faults import BadPhoto, BadShard
 
 HEIGHT, WIDTH = 12, 20
-THINGS = SHARED / "data" / "stereo" / "flyingthings3d_train_a0000_0006"
+REAL = SHARED / "data" / "stereo"
+THINGS = REAL / "flyingthings3d_train_a0000_0006"
 
 
 def png(values):
@@ -204,6 +206,50 @@ def test_a_falling_things_camera_of_another_focal_length_is_believed(tmp_path):
         StereoFolder("fallingthings", tmp_path).read(0)
 
 
+def test_where_the_range_of_falling_things_ends_nothing_is_known(tmp_path):
+    files, disparity = PUBLISHED["fallingthings"]
+    stored = DEPTH_FAT.copy()
+    stored[2, 3:5] = 65_534, 65_535
+    changed = {name: png(stored) for name in files if name.endswith(".depth.png")}
+    frame = StereoFolder("fallingthings", write(tmp_path, files | changed)).read(0)
+    assert frame.right_disparity is not None
+    for known in (frame.disparity, frame.right_disparity):
+        assert np.argwhere(np.isnan(known)).tolist() == [[2, 4]]
+        assert known[2, 3] == pytest.approx(768.1605834960938 * 0.06 / 6.5534) and np.allclose(known[3:], disparity[3:], rtol=1e-6)
+
+
+def thinned(values, share):
+    """As a lidar tells it: 0, unknown, but for the first `share` of every row."""
+    return np.where(np.arange(WIDTH) < share * WIDTH, values, 0)
+
+
+@pytest.mark.parametrize(("side", "name"), [("left", "disparity map"), ("right", "right disparity map")])
+def test_a_sparse_truth_is_refused_whichever_view_it_is_of(tmp_path, side, name):
+    files = PUBLISHED["sceneflow-clean"][0]
+    truth = f"FlyingThings3D/disparity/TRAIN/A/0000/{side}/0006.pfm"
+    for share in (0.25, 0.45):
+        pairs = StereoFolder("sceneflow-clean", write(tmp_path, files | {truth: pfm(thinned(DISPARITY, share))}))
+        with pytest.raises(BadPhoto, match=f"^sparse truth: {100 * share:.0f} % of the {name} is known, half is needed$"):
+            pairs.read(0)
+    (tmp_path / truth).write_bytes(pfm(thinned(DISPARITY, 0.5)))
+    frame = pairs.read(0)
+    known = frame.disparity if side == "left" else frame.right_disparity
+    assert known is not None and np.isnan(known).mean() == 0.5
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the real pairs are not here")
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_of_the_real_pairs_only_those_of_a_lidar_are_sparse():
+    refused = []
+    for folder in find_pairs(REAL):
+        pair = read_pair(folder)
+        try:
+            StereoFrame(pair.left, pair.right, np.where(pair.valid, pair.disparity, np.nan), None).checked()
+        except BadPhoto as fault:
+            refused.append((pair.name, fault.reason))
+    assert refused == [("kitti2012_000001", "sparse truth: 24 % of the disparity map is known, half is needed")]
+
+
 def test_values_that_mean_nothing_are_unknown(tmp_path):
     stored = DISPARITY.copy()
     stored[0, :3] = 0, np.inf, np.nan
@@ -242,7 +288,7 @@ def test_damaged_files_of_a_pair_are_told_apart(tmp_path):
     cases = {
         "damaged map: it holds 96 of the 960 bytes of 20 x 12 values": {truth: files[truth][: -(960 - 96)]},
         "sizes differ: the disparity is 19 x 12, the left image 20 x 12": {truth: pfm(DISPARITY[:, 1:])},
-        "no disparity: the map has no positive value": {truth: pfm(0 * DISPARITY)},
+        "sparse truth: 0 % of the disparity map is known": {truth: pfm(0 * DISPARITY)},
         "empty file": {"FlyingThings3D/frames_cleanpass/TRAIN/A/0000/right/0006.png": b""},
     }
     for message, change in cases.items():
@@ -308,6 +354,26 @@ def test_pairs_come_from_tars_as_from_folders(tmp_path):
     assert frame.right_disparity is not None and np.allclose(frame.right_disparity, RIGHT_DISPARITY, rtol=1e-6)
     assert np.allclose(other.disparity, stored / 256) and other.right_disparity is None
     assert pairs.digest != StereoTars(first).digest == StereoTars(str(tmp_path / "a.tar")).digest
+
+
+@pytest.mark.parametrize(("extension", "stored"), [("pfm", pfm), ("npy", npy)])
+def test_a_sign_that_is_the_direction_of_the_shift_counts_for_nothing(tmp_path, extension, stored):
+    """As some releases of Scene Flow write the right view's disparity; what nobody knows stays unknown."""
+    truth = -RIGHT_DISPARITY
+    truth[1, :4] = 0, np.inf, -np.inf, np.nan
+    members = tar_members("0001") | {f"0001.disp_right.{extension}": stored(truth)}
+    known = StereoTars(write_tar(tmp_path / "a.tar", members)).read(0).right_disparity
+    assert known is not None and np.isnan(known[1, :4]).all() and np.isnan(known).sum() == 4
+    assert np.allclose(known[2:], RIGHT_DISPARITY[2:], rtol=1e-6)
+
+
+def test_what_is_below_0_among_positive_disparities_is_unknown(tmp_path):
+    """Such as -1, by which many say that nobody knows."""
+    truth = DISPARITY.copy()
+    truth[3, 5:7] = -1
+    members = tar_members("0001", disparity=pfm(truth))
+    known = StereoTars(write_tar(tmp_path / "a.tar", members)).read(0).disparity
+    assert np.argwhere(np.isnan(known)).tolist() == [[3, 5], [3, 6]]
 
 
 def test_incomplete_pairs_and_damage_in_tars_are_told(tmp_path, caplog):

@@ -8,6 +8,7 @@ import psutil
 import pytest
 import torch
 
+from tests.hub_cache import COMMITS, run_offline, save_to_hub
 from tests.scenes import jpeg, layered_depth, photo, photo_tar, write_tar
 from trainers.inpaint_data.batches import making, requests
 from trainers.inpaint_data.examples import SYMMETRIC_COLOUR, from_photo, from_stereo, hidden_from_left
@@ -201,6 +202,43 @@ def test_a_photo_is_the_truth_of_what_a_left_view_hides(monkeypatch):
     assert 10 < sum(shares) < 30
 
 
+def a_thing_far_away(width=256):
+    """A small thing before a background at infinity: only crops of its rows can show a hole, and few of them do."""
+    near = np.zeros((64, width), np.float32)
+    near[8:24, 100:116] = 1
+    return photo(5, 64, width), near
+
+
+def wide_photo_example(size, draw):
+    image, near = a_thing_far_away()
+    return from_photo(image, torch.from_numpy(near)[None, None], AdaptiveDisparity(), size, draw)
+
+
+def wide_stereo_example(size, draw):
+    image, near = a_thing_far_away()
+    return from_stereo(StereoFrame(image, image, 0.01 + 12 * near, None), size, draw)
+
+
+@pytest.mark.parametrize("make", [wide_photo_example, wide_stereo_example])
+def test_a_crop_without_a_hole_makes_way_for_another_of_its_rows(monkeypatch, make):
+    plain(monkeypatch)
+    stayed, empty, moved = 0, 0, set()
+    for index in range(150):
+        whole, part = (make(size, drawing(index=index)) for size in ((64, 256), (24, 32)))
+        _, *place = drawing(index=index)("view").random(3)
+        top, left = (int(share * count) for share, count in zip(place, (64 - 24 + 1, 256 - 32 + 1), strict=True))
+        rows = [field[..., top : top + 24, :] for field in whole]
+        if rows[2].any() and not rows[2][..., left : left + 32].any():
+            (left,) = (new for new in range(225) if torch.equal(part.right, rows[0][..., new : new + 32]))
+            assert part.inpaint_mask.any()
+            moved.add(left)
+        else:
+            stayed, empty = stayed + 1, empty + (not rows[2].any())
+        for cut, uncut in zip(part, rows, strict=True):
+            assert torch.equal(cut, uncut[..., left : left + 32])
+    assert stayed > empty > 0 and len(moved) > 20 and max(moved) - min(moved) > 30, "as likely wherever a hole is seen"
+
+
 class Pairs:
     """Three pairs, of which one is broken."""
 
@@ -281,6 +319,37 @@ def test_depth_stored_beside_the_photos_gives_the_examples_of_the_estimator_that
     }
     with pytest.raises(ValueError, match="not one of the 3 photos"):
         made("stored", photos)
+
+
+def test_the_depth_of_photos_stays_at_its_commit_and_a_run_is_not_resumed_with_another(tmp_path):
+    small = pytest.importorskip("tests.small_depth_networks")
+    main = save_to_hub(tmp_path, "somebody/depth", lambda number, path: small.save_small_network("depth_anything", path, seed=number))
+    tar = photo_tar(tmp_path / "photos.tar", 2, height=64, width=96)
+    program = f"""
+from pathlib import Path
+import torch
+from trainers.inpaint_data.sources import Examples, PhotoSource
+from zsdata import AdaptiveDisparity, DepthNetwork
+from zsdata.position import Position
+from zsdata.source.manifest import build_manifest
+
+def examples(**options):
+    depth = DepthNetwork("somebody/depth", **options)
+    return Examples({{"photos": PhotoSource(build_manifest({str(tar)!r}), depth, AdaptiveDisparity())}}, (32, 48), 0, 2)
+
+first = examples()
+Path({str(main)!r}).write_text({COMMITS[1]!r})
+second, again = examples(), examples(revision={COMMITS[0]!r})
+masks = [[one[0, number].inpaint_mask for number in range(2)] for one in (first, second, again)]
+assert all(map(torch.equal, masks[0], masks[2])) and not all(map(torch.equal, masks[0], masks[1]))
+Position.from_state(first.position(1).to_state(), again.position(1))
+try:
+    Position.from_state(first.position(1).to_state(), second.position(1))
+    raise SystemExit("another commit was taken")
+except ValueError as error:
+    assert "somebody/depth@{COMMITS[0]}" in str(error), error
+"""
+    run_offline(program, tmp_path)
 
 
 def test_a_strip_is_replaced_before_a_depth_network_sees_it_enlarged(tmp_path):

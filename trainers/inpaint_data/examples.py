@@ -5,7 +5,8 @@ From a single photo, without any stereo: the photo is taken for the right image,
 view shows is then a question of geometry alone, the one that the warp answers for the left image, seen in a mirror: a mirror swaps the
 two cameras. What no left view shows is masked, and the photo itself is the truth.
 
-Neither is cut before it is warped: what lies beside a crop hides part of it, or lands in it.
+Neither is cut before it is warped: what lies beside a crop hides part of it, or lands in it. A crop that shows no hole makes way for
+another of the same rows: it teaches nothing, and in use it would not reach the network.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def from_stereo(frame: StereoFrame, size: tuple[int, int], draw: Draw) -> Exampl
     Args:
         size: (height, width) of the crop, in pixels.
     """
-    mirror, *place = draw("view").random(3)
+    mirror, *place, instead = draw("view").random(4)
     left, right, disparity = frame.left, frame.right, frame.disparity
     if frame.right_disparity is not None and mirror < 0.5:
         left, right, disparity = (np.ascontiguousarray(part[:, ::-1]) for part in (frame.right, frame.left, frame.right_disparity))
@@ -74,6 +75,7 @@ def from_stereo(frame: StereoFrame, size: tuple[int, int], draw: Draw) -> Exampl
     grown = grown.masked_fill(~known, torch.nan)  # covers nothing
     left, right = augment(_image(left[rows]), _image(right[rows]), [draw("augment")], SYMMETRIC_COLOUR)
     warped = forward_warp(left, grown[..., rows, :])
+    columns = _with_hole(columns, warped.inpaint_mask, instead)
     return Example(
         right[..., columns].contiguous(), warped.right[..., columns].contiguous(), warped.inpaint_mask[..., columns].contiguous()
     )
@@ -91,7 +93,7 @@ def from_photo(photo: np.ndarray, inverse_depth: Tensor, scale: AdaptiveDisparit
         scale: draws the disparity of the nearest point.
         size: (height, width) of the crop, in pixels.
     """
-    mirror, *place = draw("view").random(3)
+    mirror, *place, instead = draw("view").random(4)
     if mirror < 0.5:
         photo, inverse_depth = np.ascontiguousarray(photo[:, ::-1]), inverse_depth.flip(-1)
     height, width = _enlarged(photo.shape[:2], size)
@@ -102,7 +104,9 @@ def from_photo(photo: np.ndarray, inverse_depth: Tensor, scale: AdaptiveDisparit
     rows, columns = _window((height, width), size, place)
     disparity = inverse_depth * (scale.draw_scale(draw("disparity"), width) * width)
     disparity = sharpen_disparity(dilate_disparity(disparity)).clamp(min=SMALLEST_DISPARITY_PX)
-    inpaint_mask = hidden_from_left(disparity[..., rows, :])[..., columns].contiguous()
+    hidden = hidden_from_left(disparity[..., rows, :])
+    columns = _with_hole(columns, hidden, instead)
+    inpaint_mask = hidden[..., columns].contiguous()
     crop = _image(photo[rows, columns])
     _, right = augment(crop, crop, [draw("augment")], SYMMETRIC_COLOUR)
     return Example(right, right.masked_fill(inpaint_mask, 0), inpaint_mask)
@@ -130,6 +134,18 @@ def _enlarged(image: tuple[int, int], crop: tuple[int, int]) -> tuple[int, int]:
 def _window(image: tuple[int, int], crop: tuple[int, int], place: list[float]) -> tuple[slice, slice]:
     top, left = (int(share * (whole - part + 1)) for share, whole, part in zip(place, image, crop, strict=True))
     return slice(top, top + crop[0]), slice(left, left + crop[1])
+
+
+def _with_hole(columns: slice, inpaint_mask: Tensor, share: float) -> slice:
+    """`columns` where they show a hole of `inpaint_mask`, [1, 1, H, W]; else as many others that do, each as likely, drawn by `share` in
+    [0, 1). Where none do, `columns` stay."""
+    width = columns.stop - columns.start
+    shows_hole = inpaint_mask.flatten(0, 2).any(0).unfold(0, width, 1).any(1)  # by the first column
+    if shows_hole[columns.start] or not shows_hole.any():
+        return columns
+    choices = shows_hole.nonzero().flatten()
+    left = int(choices[int(share * len(choices))])
+    return slice(left, left + width)
 
 
 def _image(image: np.ndarray) -> Tensor:

@@ -26,6 +26,7 @@ VKITTI2_FOCAL_PX, VKITTI2_BASELINE_M, VKITTI2_CENTIMETRES = 725.0087, 0.532725, 
 VKITTI2_APART = ("vkitti_2.0.3_rgb/", "vkitti_2.0.3_depth/")  # the names of its tars
 # Falling Things (README of the data set): 16-bit PNG of depth in tenths of a millimetre; the focal length lies beside the images.
 FALLING_THINGS_FOCAL_PX, FALLING_THINGS_BASELINE_M, FALLING_THINGS_UNITS = 768.16058349609375, 0.06, 10_000
+FALLING_THINGS_END = 65_535  # of the range, 6.5535 m: what is farther is stored as that
 FALLING_THINGS_CAMERA = "_camera_settings.json"
 
 
@@ -65,6 +66,7 @@ def _falling_things(stored: np.ndarray, folder: Path) -> np.ndarray:
             focal_px = float(json.loads(camera.read_text())["camera_settings"][0]["intrinsic_settings"]["fx"])
         except (ValueError, KeyError, IndexError, TypeError) as error:
             raise BadPhoto(f"damaged camera: {camera} gives no focal length: {error!r}") from error
+    stored = np.where(stored < FALLING_THINGS_END, stored, np.nan)  # its disparity would be read as 7 px, and may be anything below
     return focal_px * FALLING_THINGS_BASELINE_M * FALLING_THINGS_UNITS / stored
 
 

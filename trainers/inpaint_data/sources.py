@@ -19,6 +19,7 @@ from trainers.inpaint_data.examples import Draw, Example, from_photo, from_stere
 from trainers.inpaint_data.layouts import StereoFolder
 from trainers.inpaint_data.tars import StereoTars
 from zsdata.faults import BadPhoto, BadShard, NoUsablePhoto
+from zsdata.hub import hub_models
 from zsdata.meter import Meter
 from zsdata.plan import Choice, EpochPlan
 from zsdata.position import Position
@@ -28,14 +29,15 @@ from zsdata.source.manifest import Manifest
 from zsdata.source.photo import PhotoFile
 from zsdata.sources import check_depth_maps
 from zsdata.stream import DEPTH_CACHE_BYTES
-from zsdata.synthesis.depth import DepthEstimator, load_depth
+from zsdata.synthesis.depth import DepthEstimator, DepthNetwork, as_network, load_depth
 from zsdata.synthesis.depth.builtin import warn_once
 from zsdata.synthesis.depth.cache import DepthCache, photo_digest
-from zsdata.synthesis.depth.identity import depth_identity
+from zsdata.synthesis.depth.identity import depth_identity, pinned
+from zsdata.synthesis.depth.maps import NEAREST, depth_maps
 from zsdata.synthesis.depth.options import STORED
 from zsdata.synthesis.depth.pretrained import preprocessing_of
 from zsdata.synthesis.disparity import AdaptiveDisparity
-from zsdata.synthesis.synthesizer import NEAREST, SynthesisConfig, estimate_depth, given_depth
+from zsdata.synthesis.synthesizer import SynthesisConfig, estimate_depth
 from zsdata.worker import MOST_SPARES, SHORTEST_SIDE_PX, single_thread, store_depth
 
 logger = logging.getLogger("zsdata")
@@ -46,6 +48,11 @@ class Source(Protocol):
 
     @property
     def digest(self) -> str: ...
+
+    @property
+    def models(self) -> dict[str, str]:
+        """Those of the Hub that take part: "owner/name@commit" by what they are used for."""
+        ...
 
     def __len__(self) -> int: ...
 
@@ -67,6 +74,10 @@ class StereoSource:
     @property
     def digest(self) -> str:
         return self.pairs.digest
+
+    @property
+    def models(self) -> dict[str, str]:
+        return {}
 
     def __len__(self) -> int:
         return len(self.pairs)
@@ -99,13 +110,13 @@ class PhotoSource:
     def __init__(
         self,
         manifest: Manifest,
-        depth: str | DepthEstimator,
+        depth: str | DepthNetwork | DepthEstimator,
         scale: AdaptiveDisparity,
         depth_cache: str | os.PathLike[str] | None = None,
     ) -> None:
         if depth == STORED and depth_cache is not None:
             raise ValueError(f'depth "{STORED}" is read from the tars, and a depth cache would keep it a second time; leave the cache out')
-        self._manifest, self._name, self._scale = manifest, depth, scale
+        self._manifest, self._scale = manifest, scale
         self._depth: DepthEstimator | None = None
         if manifest.problems:
             first = manifest.problems[0]
@@ -113,6 +124,8 @@ class PhotoSource:
                 "%d faults in the tars of photos, the first: %s: %s", len(manifest.problems), first.key or first.shard, first.reason
             )
         self._preprocessing = preprocessing_of(depth)  # what cannot be loaded fails here, and not in a worker
+        network = as_network(depth)
+        self._name = depth = depth if network is None else pinned(network)
         if depth == STORED:
             check_depth_maps("photos", manifest)
         elif depth == "builtin":
@@ -123,8 +136,16 @@ class PhotoSource:
 
     @property
     def digest(self) -> str:
-        depth = self._name if isinstance(self._name, str) else getattr(self._name, "__qualname__", type(self._name).__qualname__)
+        depth: Any = self._name
+        if isinstance(depth, DepthNetwork):
+            depth = [depth.name, depth.resolution, depth.predicts, depth.dtype]
+        elif callable(depth):
+            depth = getattr(depth, "__qualname__", type(depth).__qualname__)
         return hashlib.sha256(json.dumps([self._manifest.digest, depth, asdict(self._scale)]).encode()).hexdigest()
+
+    @property
+    def models(self) -> dict[str, str]:
+        return hub_models(self._name)
 
     def __len__(self) -> int:
         return len(self._manifest)
@@ -149,7 +170,7 @@ class PhotoSource:
             raise BadPhoto(refused)
         photo = file.decode()
         if stored is not None:
-            depth = given_depth(torch.from_numpy(decode_depth(stored, file.header))[None, None]).inverse_depth
+            depth = depth_maps(torch.from_numpy(decode_depth(stored, file.header))[None, None], None).inverse_depth
         else:
             depth = self._estimated(photo, data)
         return from_photo(photo, depth.float() / NEAREST, self._scale, size, draw)
@@ -264,6 +285,7 @@ class Examples:
             samples=place,
             manifest=hashlib.sha256(json.dumps(digests).encode()).hexdigest(),
             configuration=hashlib.sha256(json.dumps([self.size, self._batch_size]).encode()).hexdigest(),
+            models={use: model for source in self._sources.values() for use, model in source.models.items()},
         )
 
 

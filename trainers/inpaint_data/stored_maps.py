@@ -12,6 +12,8 @@ from trainers.pfm import parse_pfm
 from zsdata.faults import BadPhoto
 
 MAP_EXTENSIONS = ("png", "pfm", "npy")
+SPARSE_TRUTH = "sparse truth"  # the reason that such pairs are counted by: no failure, as outdoor scenes of Falling Things have it
+LEAST_KNOWN = 0.5  # share of a map; what nobody knows becomes a hole, and where a lidar tells the truth that is most of the example
 
 
 class StereoFrame(NamedTuple):
@@ -23,13 +25,14 @@ class StereoFrame(NamedTuple):
     right_disparity: np.ndarray | None  # the same of the right view: right (x, y) is left (x + disparity, y)
 
     def checked(self) -> StereoFrame:
-        """Itself; raises BadPhoto where its parts differ in size or no disparity is known."""
+        """Itself; raises BadPhoto where its parts differ in size or a truth is sparse."""
         for name, part in (("right image", self.right), ("disparity", self.disparity), ("right disparity", self.right_disparity)):
             if part is not None and part.shape[:2] != self.left.shape[:2]:
                 height, width = self.left.shape[:2]
                 raise BadPhoto(f"sizes differ: the {name} is {part.shape[1]} x {part.shape[0]}, the left image {width} x {height}")
-        if not np.isfinite(self.disparity).any():
-            raise BadPhoto("no disparity: the map has no positive value")
+        for name, disparity in (("disparity map", self.disparity), ("right disparity map", self.right_disparity)):
+            if disparity is not None and (known := np.isfinite(disparity).mean()) < LEAST_KNOWN:
+                raise BadPhoto(f"{SPARSE_TRUTH}: {int(100 * known)} % of the {name} is known, half is needed")
         return self
 
 

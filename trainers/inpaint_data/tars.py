@@ -4,7 +4,9 @@
     KEY.disp.EXT                   disparity of the left view: .pfm or .npy in pixels, .png of 16 bits 256 times that
     KEY.disp_right.EXT             the same of the right view, where it is known
 
-0, inf and NaN mean that nobody knows. Nothing is unpacked and nothing in a tar is ever run.
+0, inf and NaN mean that nobody knows; of each map at least half is to be known. The sign of a map that is nowhere above 0 is the direction
+of the shift, as some releases of Scene Flow write it for the right view, and counts for nothing; in other maps what is below 0 is unknown.
+Nothing is unpacked and nothing in a tar is ever run.
 """
 
 from __future__ import annotations
@@ -100,7 +102,10 @@ class StereoTars:
     def _disparity(self, index: int, name: str) -> np.ndarray:
         extension = self._pairs[index].parts[name].extension
         stored = decode_map(self._bytes(index, name), extension) / (PNG_DIVISOR if extension == "png" else 1)
-        return np.where(np.isfinite(stored) & (stored > 0), stored, np.nan).astype(np.float32)
+        stored = np.where(np.isfinite(stored), stored, 0)
+        if not (stored > 0).any():
+            stored = -stored
+        return np.where(stored > 0, stored, np.nan).astype(np.float32)
 
 
 def _pairs_of(url: str, faults: list[BadShard]) -> dict[str, dict[str, _Part]]:
