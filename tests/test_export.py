@@ -21,6 +21,7 @@ from zsdata import AugmentConfig, UniformDisparity, ZeroStereoStream, export, ex
 from zsdata.export import export_pairs
 from zsdata.exported import load_exported, pair_name, place_name, read_exported
 
+from .hub_cache import COMMITS, run_offline, save_to_hub
 from .scenes import grey_fill, jpeg, layered_depth, photo, photo_tar, write_tar
 
 PUBLISHED_FOLDERS = {
@@ -278,6 +279,30 @@ def test_an_export_made_with_other_arguments_is_refused_with_the_difference(shar
         export_pairs(stream_of(shard, **options), tmp_path / "out", **{"settings": settings, **arguments})
     assert f"other arguments: {named}. " in str(raised.value).replace(" (size, depth, inpaint, disparity, view, augmentation, ...)", "")
     assert tree(tmp_path / "out") == before
+
+
+def test_an_export_does_not_go_on_with_a_model_that_has_moved(shard, tmp_path):
+    small = pytest.importorskip("tests.small_depth_networks")
+    main = save_to_hub(tmp_path, "somebody/depth", lambda number, path: small.save_small_network("depth_anything", path, seed=number))
+    program = f"""
+from pathlib import Path
+from zsdata import AugmentConfig, ZeroStereoStream
+from zsdata.export import export_pairs
+
+def export(pairs, name="somebody/depth"):
+    stream = ZeroStereoStream({str(shard)!r}, size={SIZE}, depth=name, augmentation=AugmentConfig.none())
+    return export_pairs(stream, {str(tmp_path / "out")!r}, pairs=pairs)
+
+export(2)
+Path({str(main)!r}).write_text({COMMITS[1]!r})
+try:
+    export(2)
+    raise SystemExit("two models in one export")
+except ValueError as error:
+    assert "{COMMITS[0]}" in str(error) and "{COMMITS[1]}" in str(error) and "owner/name@commit" in str(error), error
+assert export(2, "somebody/depth@{COMMITS[0]}").already_there == 2
+"""
+    run_offline(program, tmp_path)
 
 
 def test_an_export_of_other_photos_or_by_another_version_is_refused(shard, tmp_path, monkeypatch):

@@ -149,8 +149,35 @@ try:
     raise SystemExit("a state of other labels was taken")
 except ValueError as error:
     assert "somebody/depth@{COMMITS[0]}" in str(error) and "somebody/depth@{COMMITS[1]}" in str(error), error
-same = stream(DepthNetwork("somebody/depth", revision={COMMITS[0]!r}))
-same.load_state_dict(first.state_dict())
+for same in (DepthNetwork("somebody/depth", revision={COMMITS[0]!r}), "somebody/depth@{COMMITS[0]}"):
+    stream(same).load_state_dict(first.state_dict())
+"""
+    run_offline(program, tmp_path)
+
+
+def test_it_is_the_commit_that_is_used_which_must_be_commercial(tar, tmp_path):
+    """The Hub may move after the licence was looked at."""
+
+    def save(number, path):
+        small.save_small_network("depth_anything", path, seed=number)
+        (path / "README.md").write_text(f"---\nlicense: {['mit', 'cc-by-nc-4.0'][number]}\n---\n")
+
+    main = save_to_hub(tmp_path, "somebody/depth", save)
+    program = f"""
+from pathlib import Path
+import zsdata.stream
+from zsdata import ZeroStereoStream
+from zsdata.licences import NonCommercialModel
+
+first = ZeroStereoStream({str(tar)!r}, depth="somebody/depth", commercial_safe=True)
+assert first.provenance()["depth"][0]["licence"] == "mit"
+read = zsdata.stream.preprocessing_of
+zsdata.stream.preprocessing_of = lambda depth: Path({str(main)!r}).write_text({COMMITS[1]!r}) and read(depth)
+try:
+    ZeroStereoStream({str(tar)!r}, depth="somebody/depth", commercial_safe=True)
+    raise SystemExit("a model for non-commercial use was taken")
+except NonCommercialModel as error:
+    assert "cc-by-nc-4.0" in str(error), error
 """
     run_offline(program, tmp_path)
 
@@ -169,16 +196,17 @@ import torch
 from tests.scenes import layered_depth
 from zsdata import DiffusionNetwork, ZeroStereoStream, load_inpainter
 
-def stream(**options):
-    network = DiffusionNetwork("somebody/pipelines", subfolder="inner", steps=1, **options)
+def stream(name="somebody/pipelines", **options):
+    network = DiffusionNetwork(name, subfolder="inner", steps=1, **options)
     return ZeroStereoStream({str(tar)!r}, size={SIZE}, depth=layered_depth, inpaint=network, epoch_size=2)
 
-first = stream()
+first, named = stream(), stream(name="somebody/pipelines@{COMMITS[0]}")
 Path({str(main)!r}).write_text({COMMITS[1]!r})
 second, again = stream(), stream(revision={COMMITS[0]!r})
 made = [next(iter(one)).right for one in (first, second, again)]
 assert torch.equal(made[0], made[2]) and not torch.equal(made[0], made[1])
 assert [one.provenance()["inpaint"][0]["revision"] for one in (first, second, again)] == {[*COMMITS, COMMITS[0]]}
+assert again.state_dict() == first.state_dict() == named.state_dict()
 again.load_state_dict(first.state_dict())
 loaded = load_inpainter("somebody/pipelines", subfolder="inner", steps=1)
 assert loaded.network.revision is None and loaded.pinned.revision == {COMMITS[1]!r}
@@ -189,6 +217,19 @@ except ValueError as error:
     assert "'inpaint': 'somebody/pipelines@{COMMITS[0]}'" in str(error), error
 """
     run_offline(program, tmp_path)
+
+
+def test_a_name_with_a_revision_is_both(tmp_path):
+    assert DepthNetwork("owner/name@v1") == DepthNetwork("owner/name", revision="v1")
+    assert DiffusionNetwork("owner/name@v1", autoencoder="a/b@v2") == DiffusionNetwork(
+        "owner/name", revision="v1", autoencoder="a/b", autoencoder_revision="v2"
+    )
+    (tmp_path / "at@home").mkdir()
+    assert DepthNetwork(str(tmp_path / "at@home")).name == str(tmp_path / "at@home")
+    with pytest.raises(ValueError, match='"owner/name@v1" names a revision, and revision="v2" another'):
+        DepthNetwork("owner/name@v1", revision="v2")
+    with pytest.raises(ValueError, match="autoencoder_revision belongs to an autoencoder, and none is named"):
+        DiffusionNetwork("owner/name", autoencoder_revision="v2")
 
 
 @pytest.mark.parametrize(
@@ -291,7 +332,19 @@ def test_networks_that_see_whole_photos_are_warmed_up_for_the_largest_of_the_fir
     inpainting, depth, together = capsys.readouterr().err.splitlines()
     pairs, seen = (4, (64, 128)) if size else (1, (120, 192))  # of what the crop, or the photo, is filled from
     assert f"inpainting of {pairs} at {seen}:" in inpainting and f"depth of {pairs} at (120, 160):" in depth
-    assert together.endswith("the stream takes at most 3.00 GiB beside training, for photos of up to 120x160")
+    assert together.endswith("the stream takes at most 3.00 GiB beside training while no photo is larger than the first 3")
+
+
+def test_the_warm_up_of_depth_sees_the_largest_photo_and_the_one_that_is_enlarged_most(folder, tmp_path, capsys, monkeypatch):
+    seen = []
+    monkeypatch.setattr(
+        PretrainedDepth, "warm_up", lambda depth, size, most: seen.append(size) or WarmUp("depth", 2, size[1] * GIB, GIB, 1)
+    )
+    photos = {f"{i}.png": png(photo(i, *shape)) for i, shape in enumerate([(64, 240), (120, 160), (90, 130)])}
+    stream = ZeroStereoStream(write_tar(tmp_path / "a.tar", photos), size=SIZE, depth=folder, inpaint=grey_fill)
+    monkeypatch.setattr("zsdata.stream.load_depth", lambda network, device: load_depth(network))
+    stream.loader(3, device="meta")
+    assert sorted(seen) == [(64, 240), (120, 160)] and "the stream takes at most 240.00 GiB" in capsys.readouterr().err
 
 
 def test_loaded_networks_count_by_their_options(folder, tar):

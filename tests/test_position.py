@@ -77,9 +77,15 @@ def test_the_largest_state_is_small():
     assert len(json.dumps(place.to_state())) < 1000
 
 
+def test_the_state_of_another_version_says_so_whatever_it_holds():
+    with pytest.raises(ValueError, match="the state's version is 1; this zsdata reads version 2"):
+        from_state({name: value for name, value in STATE.items() if name != "models"} | {"version": 1})
+
+
 def test_a_model_that_has_moved_is_named_with_both_commits():
     then, now = (replace(HERE, models={"depth": f"depth-anything/Depth-Anything-V2-Small-hf@{digit * 40}"}) for digit in "ab")
-    with pytest.raises(ValueError, match=r"state's models is \{'depth': '[\w/-]+@a{40}'\}, this stream's is .*@b{40}.*--depth-revision"):
+    said = r"state's models is \{'depth': '[\w/-]+@a{40}'\}, this stream's is .*@b{40}.*: a model has moved on at the Hub; name it as"
+    with pytest.raises(ValueError, match=said):
         from_state(then.to_state(), now)
 
 

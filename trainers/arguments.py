@@ -63,7 +63,8 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
         "--depth",
         default="builtin",
         metavar="NAME",
-        help='"builtin", "stored" (maps beside the photos in the tars), a Hub id or folder in the transformers format (default: builtin)',
+        help='"builtin", "stored" (maps beside the photos in the tars), a Hub id ("owner/name", or "owner/name@commit") or a folder in the '
+        "transformers format (default: builtin)",
     )
     stream.add_argument(
         "--inpaint",
@@ -77,7 +78,6 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PX",
         help="short side of a depth network's input in pixels, or \"native\", the photo's own size (default: the network's own)",
     )
-    stream.add_argument("--depth-revision", metavar="REV", help="branch, tag or commit of a Hub id")
     stream.add_argument(
         "--depth-placement",
         choices=DEPTH_PLACEMENTS,
@@ -97,7 +97,6 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
         help='another autoencoder, such as the tiny and fast "madebyollin/taesd" (default: its own)',
     )
     stream.add_argument("--inpaint-subfolder", metavar="NAME", help='where it lies in --inpaint: "StereoGen" in "Windsrain/ZeroStereo"')
-    stream.add_argument("--inpaint-revision", metavar="REV", help="branch, tag or commit of a Hub id")
     stream.add_argument("--views-per-image", type=int, default=1, metavar="K", help="samples in a row from one photo (default: 1)")
     stream.add_argument(
         "--reuse", type=int, default=1, metavar="K", help="samples in a row from one pair, with augmentations of their own (default: 1)"
@@ -239,7 +238,7 @@ def open_stream(arguments: argparse.Namespace) -> ZeroStereoStream:
 
 
 def _depth(arguments: argparse.Namespace) -> str | DepthNetwork:
-    options = _options_of(arguments, "depth", ("resolution", "revision"))
+    options = _options_of(arguments, "depth", ("resolution",))
     if arguments.depth in ("builtin", "stored"):
         if options:
             raise ValueError(f"--depth-{next(iter(options))} belongs to a depth network; --depth is {arguments.depth}")
@@ -250,7 +249,7 @@ def _depth(arguments: argparse.Namespace) -> str | DepthNetwork:
 
 
 def _inpainter(arguments: argparse.Namespace) -> Any:
-    options = _options_of(arguments, "inpaint", ("steps", "scheduler", "autoencoder", "subfolder", "revision"))
+    options = _options_of(arguments, "inpaint", ("steps", "scheduler", "autoencoder", "subfolder"))
     if arguments.inpaint in ("none", "builtin", "background"):
         if options:
             raise ValueError(f"--inpaint-{next(iter(options))} belongs to a diffusion network; --inpaint is {arguments.inpaint}")
@@ -329,7 +328,7 @@ def run(main: Any) -> None:
     except (ValueError, ImportError, OSError, MemoryError, NoUsablePhoto, TooManyFaults, TrainingDiverged, WorkerLost) as error:
         sys.exit(f"{Path(sys.argv[0]).name}: {error}")
     except RuntimeError as error:
-        if not isinstance(error.__cause__, (ImportError, OSError)):  # a sample failed for want of a model's file or package
+        if not isinstance(error.__cause__, (ImportError, OSError, MemoryError)):  # a sample failed for want of a file, package or memory
             raise
         sys.exit(f"{Path(sys.argv[0]).name}: {error}")
     except KeyboardInterrupt:

@@ -42,7 +42,7 @@ from trainers.inpaint_data.tars import StereoTars
 from trainers.inpaint_loop import TuneConfig, tune
 from trainers.pairs_on_disk import StereoPair, find_pairs, motorcycle, read_pair
 from trainers.pipeline_folder import local_pipeline
-from zsdata import AdaptiveDisparity, DepthNetwork
+from zsdata import AdaptiveDisparity
 from zsdata.source.manifest import build_manifest
 
 TARS = "tars"
@@ -94,13 +94,8 @@ def open_sources(arguments: argparse.Namespace) -> dict[str, Source]:
         if kind in sources:
             raise ValueError(f"{kind} is named twice; put both below one folder, or give a pattern of tars")
         sources[kind] = StereoSource(StereoTars(where) if kind == TARS else StereoFolder(kind, where))
-    depth = arguments.depth
-    if arguments.depth_revision is not None:
-        if depth in ("builtin", "stored"):
-            raise ValueError(f"--depth-revision belongs to a depth network of the Hub; --depth is {depth}")
-        depth = DepthNetwork(depth, revision=arguments.depth_revision)
     if arguments.photos:
-        sources["photos"] = PhotoSource(build_manifest(arguments.photos), depth, AdaptiveDisparity(), arguments.depth_cache)
+        sources["photos"] = PhotoSource(build_manifest(arguments.photos), arguments.depth, AdaptiveDisparity(), arguments.depth_cache)
     elif arguments.depth_cache is not None:
         raise ValueError("--depth-cache keeps the depth of photos; name --photos, or leave it out")
     if not sources:
@@ -137,7 +132,6 @@ def _parser() -> argparse.ArgumentParser:
         help='for photos: "builtin", a Hub id or folder in the transformers format, or "stored", the maps beside them in the tars, where '
         "`zsdata pack` puts NAME.depth.npy or NAME.depth.png with NAME.jpg (default: builtin)",
     )
-    data.add_argument("--depth-revision", metavar="REV", help="branch, tag or commit of a Hub id")
     data.add_argument(
         "--depth-cache",
         metavar="DIR",

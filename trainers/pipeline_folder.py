@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from zsdata.synthesis.inpaint.diffusion_parts import OTHER_PARTS, WEIGHTED_PARTS
+from zsdata.synthesis.model_name import split_revision
 
 UNET = "unet"
 FROZEN_PARTS = tuple(part for part in (*WEIGHTED_PARTS, *OTHER_PARTS) if part != UNET)
@@ -27,7 +28,7 @@ def local_pipeline(name: str, subfolder: str = "", revision: str | None = None) 
     forms of weights that nobody needs here.
 
     Args:
-        name: a local folder or a Hub id ("owner/name").
+        name: a local folder or a Hub id ("owner/name", or "owner/name@revision").
         subfolder: where in it the pipeline lies.
         revision: branch, tag or commit of a Hub id.
 
@@ -35,6 +36,7 @@ def local_pipeline(name: str, subfolder: str = "", revision: str | None = None) 
         FileNotFoundError: neither a folder nor a Hub id; or the folder has no such subfolder.
         OSError: the Hub does not have it, or cannot be reached.
     """
+    name, revision = split_revision(name, revision)
     if os.path.isdir(name):
         if not Path(name, subfolder).is_dir():
             raise FileNotFoundError(f'no folder "{subfolder}" in {name}')

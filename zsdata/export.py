@@ -78,7 +78,7 @@ def export_pairs(
     record = {
         "zsdata": zsdata.__version__,
         **(settings or {}),
-        **{name: state[name] for name in ("seed", "manifest", "configuration")},
+        **{name: state[name] for name in ("seed", "manifest", "configuration", "models") if state[name] != {}},
         "epoch": epoch,
         "pairs": count,
     }
@@ -137,8 +137,10 @@ def _compare(folder: Path, now: dict[str, Any]) -> None:
         in_words["manifest"] = "the photos, or their order, are others"
     if "configuration" in in_words:
         in_words["configuration"] = "an option of the stream is another (size, depth, inpaint, disparity, view, augmentation, ...)"
-        if in_words.keys() - {"configuration", "manifest", "seed", "epoch", "pairs", "zsdata"}:
+        if in_words.keys() - {"configuration", "manifest", "models", "seed", "epoch", "pairs", "zsdata"}:
             del in_words["configuration"]  # named already
+    if "models" in in_words:
+        in_words["models"] += ' (a model that has moved on at the Hub can be named as it was, "owner/name@commit")'
     if in_words:
         raise ValueError(f"{folder} holds an export made with other arguments: {'; '.join(in_words.values())}. Choose another folder.")
 

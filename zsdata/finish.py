@@ -5,6 +5,7 @@ Where depth is the device's work too, it first makes the pairs: the same functio
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -22,6 +23,7 @@ from zsdata.seeding import rng
 from zsdata.synthesis.depth import DepthEstimator
 from zsdata.synthesis.depth.maps import DepthMaps
 from zsdata.synthesis.inpaint import Inpainter, fill
+from zsdata.synthesis.micro_batch import WarmUp
 from zsdata.synthesis.synthesizer import INPAINT_CONTEXT_PX, estimate_depth, predict_depth
 from zsdata.worker import Recipe, Worker, naming, single_thread, store_depth
 
@@ -57,6 +59,18 @@ class Synthesis:
         meta = [{**pairs.meta[row], "index": sample["index"]} for row, sample in zip(drafts.rows, drafts.meta, strict=True)]
         rejected = [reject for draft in drawn for reject in draft.rejected]
         return replace(pairs, meta=meta, rejected=rejected, seconds=drafts.seconds, rows=drafts.rows)
+
+    def warm_up(self, photos: Sequence[tuple[int, int]], samples: int) -> Any:
+        """Of the depth estimator, which has one, for so many photos at once: of the photo with most pixels, and of the one that is largest
+        to the network, which sees a narrow one enlarged. What the one that takes more memory says."""
+        depth: Any = self.depth
+        preprocessing = self.recipe.preprocessing
+
+        def seen_pixels(photo: tuple[int, int]) -> int:
+            return math.prod(photo if preprocessing is None else preprocessing.input_size(*photo))
+
+        said = [depth.warm_up(photo, samples) for photo in {max(photos, key=math.prod), max(photos, key=seen_pixels)}]
+        return max(said, key=lambda one: getattr(one, "peak_bytes", None) or 0)
 
     def _make(self, draft: Draft, depth: DepthMaps, device: torch.device, meter: Meter) -> Prepared:
         inverse_depth, confidence = (values.to(device, non_blocking=True) for values in (depth.inverse_depth, depth.confidence))
@@ -121,17 +135,17 @@ class Finisher:
         networks = [self.inpainter, None if self.synthesis is None else self.synthesis.depth]
         return sum(getattr(getattr(network, "micro_batch", None), "lowered", 0) for network in networks)
 
-    def warm_up(self, size: tuple[int, int], photo: tuple[int, int], batch_size: int) -> list[Any]:
-        """Makes the networks ready for batches of crops of this (height, width), of photos of that one, while training has memory and time
-        to spare; what each of them says."""
+    def warm_up(self, size: tuple[int, int], photos: Sequence[tuple[int, int]], batch_size: int) -> list[WarmUp]:
+        """Makes the networks ready for batches of crops of this size, of photos of those sizes, while training has memory and time to
+        spare; what each of them says. Sizes are (height, width)."""
         height, width = size
         pairs = 1 + -(-(batch_size - 1) // self.reuse)  # the most distinct ones that a batch can have
-        steps: list[tuple[Any, tuple[int, int], int]] = [
-            (self.inpainter, (height, width + INPAINT_CONTEXT_PX), min(pairs, self.micro_batch or pairs))
-        ]
-        if self.synthesis is not None:
-            steps.append((self.synthesis.depth, photo, pairs))
-        return [step.warm_up(area, samples) for step, area, samples in steps if hasattr(step, "warm_up")]
+        ready = list[Any]()
+        if hasattr(self.inpainter, "warm_up"):
+            ready.append(self.inpainter.warm_up((height, width + INPAINT_CONTEXT_PX), min(pairs, self.micro_batch or pairs)))
+        if self.synthesis is not None and hasattr(self.synthesis.depth, "warm_up"):
+            ready.append(self.synthesis.warm_up(photos, pairs))
+        return [said for said in ready if isinstance(said, WarmUp)]
 
     @torch.no_grad()
     def __call__(self, prepared: Prepared | Drafts, meter: Meter) -> StereoBatch:

@@ -17,8 +17,8 @@ import yaml
 from huggingface_hub import hf_hub_download, metadata_load, try_to_load_from_cache
 from huggingface_hub.errors import HfHubHTTPError
 
-from zsdata.synthesis.depth.options import STORED, DepthNetwork
-from zsdata.synthesis.inpaint.options import DiffusionNetwork
+from zsdata.hub import Model, models_of
+from zsdata.synthesis.depth.options import STORED
 
 logger = logging.getLogger("zsdata")
 
@@ -60,10 +60,11 @@ ALTERNATIVES = {
     "depth": '"depth-anything/Depth-Anything-V2-Small-hf" (apache-2.0), "Intel/zoedepth-nyu-kitti" (mit) or "builtin"',
     "inpaint": '"Windsrain/ZeroStereo" with subfolder "StereoGen" (mit), "sd2-community/stable-diffusion-2-inpainting" (openrail++) '
     'or "builtin"',
+    "autoencoder": '"madebyollin/taesd" (mit), or the pipeline\'s own',
 }
 
 
-_told: set[tuple[str, str | None, str]] = set()  # models that were warned of, in this process
+_told: set[Model] = set()  # models that were warned of, in this process
 
 
 class NonCommercialModel(ValueError):
@@ -105,25 +106,11 @@ def model_records(step: Any) -> list[dict[str, str | None]]:
         step: a name or path, a DepthNetwork, a DiffusionNetwork, or a callable; of one that `load_depth` or `load_inpainter` made, the
             network's.
     """
-    network = getattr(step, "pinned", step)
-    if isinstance(network, DepthNetwork | DiffusionNetwork):
-        return [model_record(*model) for model in _models(network)]
-    if isinstance(network, str | os.PathLike):
-        return [model_record(os.fspath(network))]
-    kind = network if hasattr(network, "__qualname__") else type(network)
+    if models := models_of(step, ""):
+        return [model_record(model.name, model.revision, model.subfolder) for model in models]
+    kind = step if hasattr(step, "__qualname__") else type(step)
     own = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
     return [{"id": f"{kind.__module__}.{kind.__qualname__}", "revision": None, "licence": OWN_LICENCE if own else None}]
-
-
-def _models(step: Any) -> list[tuple[str, str | None, str]]:
-    """(name, revision, subfolder) of every model behind a name, a path, a DepthNetwork or a DiffusionNetwork."""
-    network = getattr(step, "pinned", step)
-    if isinstance(network, DepthNetwork):
-        return [(network.name, network.revision, "")]
-    if isinstance(network, DiffusionNetwork):
-        other = [] if network.autoencoder is None else [(network.autoencoder, network.autoencoder_revision, "")]
-        return [(network.name, network.revision, network.subfolder), *other]
-    return [(os.fspath(network), None, "")] if isinstance(network, str | os.PathLike) else []
 
 
 def fetch_cards(*steps: Any) -> None:
@@ -132,7 +119,7 @@ def fetch_cards(*steps: Any) -> None:
     Args:
         steps: as `model_records` takes them.
     """
-    for name, revision, _ in (model for step in steps for model in _models(step)):
+    for _, name, revision, _ in (model for step in steps for model in models_of(step, "")):
         if name in (*BUILT_IN, STORED) or os.path.isdir(name) or name.lower() in KNOWN:
             continue
         try:
@@ -143,7 +130,7 @@ def fetch_cards(*steps: Any) -> None:
 
 
 def require_commercial(step: Any, argument: str) -> None:
-    """Refuses models that are known to be for non-commercial use alone. One of which no licence is known passes, with a warning.
+    """Refuses models that are known to be for non-commercial use alone. One of which nothing is known passes.
 
     Args:
         step: as `model_records` takes it.
@@ -152,20 +139,24 @@ def require_commercial(step: Any, argument: str) -> None:
     Raises:
         NonCommercialModel: it names the model, its licence and alternatives.
     """
-    for model in _models(step):
-        name, *_ = model
-        for licence, reason in _licences(*model):
+    for model in models_of(step, argument):
+        for licence, reason in _licences(model.name, model.revision, model.subfolder):
             if NON_COMMERCIAL.search(licence):
                 raise NonCommercialModel(
-                    f'{argument}="{name}" is under {licence}{reason}, which allows no commercial use, and commercial_safe is set. '
-                    f"Take {ALTERNATIVES[argument]}, or leave commercial_safe out"
+                    f'{model.use}="{model.name}" is under {licence}{reason}, which allows no commercial use, and commercial_safe is set. '
+                    f"Take {ALTERNATIVES[model.use]}, or leave commercial_safe out"
                 )
-        if _silent(model_record(*model)["licence"]) and model not in _told:
+
+
+def warn_of_unknown_licences(step: Any, argument: str) -> None:
+    """Says once of each model, in a process, that `require_commercial` could not judge it, as nothing tells its licence."""
+    for model in models_of(step, argument):
+        if _silent(model_record(model.name, model.revision, model.subfolder)["licence"]) and model not in _told:
             _told.add(model)
             logger.warning(
                 'the licence of %s="%s" is not known, so commercial_safe cannot judge it; look it up where the model comes from',
-                argument,
-                name,
+                model.use,
+                model.name,
             )
 
 

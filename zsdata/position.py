@@ -12,8 +12,7 @@ CAUSES = {  # of a difference, by field
     "seed": "the stream's seed differs",
     "manifest": "the photos, their order, the sources or epoch_size differ",
     "configuration": "an option of the stream differs (size, depth, inpaint, disparity, view, augmentation, ...)",
-    "models": "a model has moved on at the Hub; name the commit as its revision (DepthNetwork, DiffusionNetwork; in the trainers "
-    "--depth-revision, --inpaint-revision)",
+    "models": 'a model has moved on at the Hub; name it as the state does, "owner/name@commit"',
 }
 _short = reprlib.Repr()
 _short.maxstring = 150  # shows "owner/name@commit" whole
@@ -46,11 +45,13 @@ class Position:
         """
         if not isinstance(state, Mapping):
             raise ValueError(f"a stream's state is a dictionary as state_dict() returns it; got {type(state).__name__}")
+        if type(state.get("version")) is int and state["version"] != VERSION:
+            raise ValueError(f"the state's version is {state['version']}; this zsdata reads version {VERSION}")
         names = {"version", *(one.name for one in fields(Position))}
         if state.keys() != names:
             unknown = _short.repr(sorted(map(str, state.keys() - names)))
             raise ValueError(f"not a stream's state: missing {sorted(names - state.keys())}, unknown {unknown}")
-        if type(state["version"]) is not int or state["version"] != VERSION:
+        if type(state["version"]) is not int:
             raise ValueError(f"the state's version is {_short.repr(state['version'])}; this zsdata reads version {VERSION}")
         for name in ("epoch", "samples"):
             if type(state[name]) is not int or not 0 <= state[name] < 2**63:

@@ -21,7 +21,7 @@ from zsdata.augment import AugmentConfig
 from zsdata.faults import FailureBudget, FaultLog
 from zsdata.finish import Finisher, Synthesis
 from zsdata.hub import hub_models
-from zsdata.licences import fetch_cards, model_records, require_commercial
+from zsdata.licences import fetch_cards, model_records, require_commercial, warn_of_unknown_licences
 from zsdata.loader import SAMPLE_TIMEOUT_SECONDS, StereoLoader
 from zsdata.meter import Meter
 from zsdata.position import Position
@@ -39,7 +39,7 @@ from zsdata.synthesis.depth.options import STORED
 from zsdata.synthesis.depth.pretrained import preprocessing_of
 from zsdata.synthesis.disparity import AdaptiveDisparity, UniformDisparity
 from zsdata.synthesis.inpaint import DiffusionNetwork, Inpainter, as_pipeline, checked_pipeline, load_inpainter
-from zsdata.synthesis.micro_batch import WarmUp, say_warm_up
+from zsdata.synthesis.micro_batch import say_warm_up
 from zsdata.synthesis.synthesizer import SynthesisConfig
 from zsdata.synthesis.view import ViewConfig
 from zsdata.worker import Recipe, Worker
@@ -100,7 +100,7 @@ class ZeroStereoStream(IterableDataset):
 
     Raises:
         ValueError, TypeError, FileNotFoundError: at once, for an argument that cannot work.
-        ImportError, OSError: the packages for a depth network are not installed, or nothing is found under its name.
+        ImportError, OSError: the packages for a network are not installed, or nothing is found under its name.
     """
 
     def __init__(
@@ -169,15 +169,19 @@ class ZeroStereoStream(IterableDataset):
             if not isinstance(depth, str) or depth in ("builtin", STORED):
                 raise ValueError(f"depth_resolution belongs to a network given by name or folder; depth is {_name_of(depth, None)!r}")
             depth = DepthNetwork(depth, resolution=depth_resolution)
-        fetch_cards(depth, self._inpaint)
-        if commercial_safe:
-            require_commercial(depth, "depth")
-            require_commercial(self._inpaint, "inpaint")
+        if commercial_safe:  # before anything is downloaded
+            for argument, step in {"depth": depth, "inpaint": self._inpaint}.items():
+                require_commercial(step, argument)
         self._depth = depth
         preprocessing = preprocessing_of(depth)
         network = as_network(depth)
         self._pinned_depth = depth = depth if network is None else pinned(network)
         self._pinned_inpaint = self._inpaint if pipeline is None else checked_pipeline(pipeline)
+        fetch_cards(self._pinned_depth, self._pinned_inpaint)
+        if commercial_safe:  # once more, of the commits that are used
+            for argument, step in {"depth": self._pinned_depth, "inpaint": self._pinned_inpaint}.items():
+                require_commercial(step, argument)
+                warn_of_unknown_licences(step, argument)
         synthesis = synthesis if synthesis is not None else SynthesisConfig()
         self._recipe = Recipe(
             seed=seed,
@@ -384,22 +388,13 @@ class ZeroStereoStream(IterableDataset):
     def _warm_up(self, finisher: Finisher, device: torch.device, batch_size: int, aloud: bool) -> None:
         """Makes the networks on the device ready for batches like the first ones."""
         size = self._recipe.size
-        photo = self._largest_photo() if size is None or finisher.synthesis is not None else None  # where networks see whole photos
-        size, whole = size or photo, photo or size
-        if size is None or whole is None:
+        see_whole_photos = size is None or finisher.synthesis is not None
+        photos = self._worker.photo_sizes(self._epoch, WARM_UP_PHOTOS) if see_whole_photos else []
+        if see_whole_photos and not photos:
             return  # not one of them can be used, as the first batch will say
-        ready = [said for said in finisher.warm_up(size, whole, batch_size) if isinstance(said, WarmUp)]
+        ready = finisher.warm_up(size or max(photos, key=math.prod), photos, batch_size)
         if ready and aloud:
-            Progress.write(say_warm_up(ready, device, photo), file=sys.stderr)
-
-    def _largest_photo(self) -> tuple[int, int] | None:
-        """(height, width) of that of the first photos which takes a network most memory."""
-        preprocessing = self._recipe.preprocessing
-
-        def pixels(photo: tuple[int, int]) -> tuple[int, int]:
-            return 0 if preprocessing is None else math.prod(preprocessing.input_size(*photo)), math.prod(photo)
-
-        return max(self._worker.photo_sizes(self._epoch, WARM_UP_PHOTOS), key=pixels, default=None)
+            Progress.write(say_warm_up(ready, device, len(photos)), file=sys.stderr)
 
     def _drafter(self) -> Worker:
         """Prepares all but depth; an estimator that was given loaded does not travel to processes that have no use for it."""

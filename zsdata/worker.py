@@ -117,6 +117,7 @@ class Worker:
                 sizes.append(self._open(sources, choice, Meter()).size)
             except (BadPhoto, BadShard):  # counted when its turn comes
                 continue
+        self._last = None  # a worker that is sent to another process takes no photo along
         return sizes
 
     def instead(self, draft: Draft, reason: str) -> Draft:

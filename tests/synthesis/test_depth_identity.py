@@ -92,7 +92,7 @@ def test_a_hub_id_is_the_commit_in_the_local_cache(hub_cache):
 
 
 def test_a_hub_id_that_was_not_downloaded_yet_is_an_error_with_the_cure(hub_cache):
-    with pytest.raises(FileNotFoundError, match=r'depth="owner/network" .* local Hub cache .* zsdata.load_depth\("owner/network"\)'):
+    with pytest.raises(FileNotFoundError, match=r'depth="owner/network" .* local Hub cache .*: hf download owner/network;'):
         depth_identity("owner/network")
 
 

@@ -362,7 +362,7 @@ def pretend_gpu(inpainter, micro_batch):
     """Lets it take more than one sample at once, which on the CPU it does not."""
     inpainter.micro_batch._most = sys.maxsize
     inpainter.micro_batch.choose(micro_batch)
-    inpainter._largest, inpainter._auto = micro_batch, inpainter.network.micro_batch == "auto"
+    inpainter._auto = inpainter.network.micro_batch == "auto"
 
 
 def count_memory(inpainter, per_sample, monkeypatch):
@@ -373,6 +373,13 @@ def count_memory(inpainter, per_sample, monkeypatch):
     monkeypatch.setattr(diffusion, "measure", counted)
     monkeypatch.setattr(micro_batch, "measure", counted)
     return tried
+
+
+def count_unet(inpainter, monkeypatch):
+    """The list of the numbers of samples that its U-Net gets from now on."""
+    seen, unet = [], inpainter._unet.forward
+    monkeypatch.setattr(inpainter._unet, "forward", lambda noisy, *_, **__: seen.append(len(noisy)) or unet(noisy, *_, **__))
+    return seen
 
 
 def limit_memory(inpainter, most, monkeypatch):
@@ -472,7 +479,7 @@ def test_a_micro_batch_that_memory_ran_out_with_is_not_tried_again(folder, monke
     pretend_gpu(inpainter, 8)
     limit_memory(inpainter, 4, monkeypatch)
     assert [inpainter.warm_up((48, 64), samples).micro_batch for samples in (8, 2, 8)] == [4, 2, 4]
-    assert inpainter.micro_batch.lowered == 1
+    assert (inpainter.micro_batch.size, inpainter.micro_batch.lowered) == (4, 1)
 
 
 def test_what_a_warm_up_says_is_not_the_memory_of_what_did_not_fit(folder, monkeypatch):
@@ -499,6 +506,28 @@ def test_without_a_warm_up_no_more_are_tried_than_have_come(folder, monkeypatch)
     for count in (1, 1, 3, 2):
         inpainter(*scenes(count), generators(*range(count)))
     assert tried == [1, *(1, 2)]
+
+
+def test_auto_measures_a_compiled_network_without_what_it_is_filled_up_with(folder, monkeypatch):
+    """A second search, for more samples, finds more, though the network was compiled for fewer before."""
+    compiled = load_inpainter(folder, steps=1, compile=True, memory_gib=8.0)
+    pretend_gpu(compiled, 1)
+    seen = count_unet(compiled, monkeypatch)
+    for module in (diffusion, micro_batch):
+        monkeypatch.setattr(module, "measure", lambda work, device: (work(), (seen[-1] * 2**28, 0.5))[1])
+    with torch.compiler.set_stance("force_eager"):
+        assert [compiled.warm_up((48, 64), samples).micro_batch for samples in (4, 16)] == [4, 16]
+    assert seen == [1, 2, 4, 4, *(1, 2, 4, 8, 16), 16]
+
+
+def test_a_smaller_warm_up_leaves_larger_batches_whole(folder, monkeypatch):
+    inpainter = load_inpainter(folder, steps=1, micro_batch=8)
+    pretend_gpu(inpainter, 8)
+    for samples in (8, 2):
+        inpainter.warm_up((48, 64), samples)
+    seen = count_unet(inpainter, monkeypatch)
+    inpainter(*scenes(8), generators(*range(8)))
+    assert seen == [8]
 
 
 def test_a_memory_limit_that_cannot_be_held_is_said(folder, monkeypatch, caplog):
@@ -529,8 +558,9 @@ def test_a_compiled_network_that_runs_out_of_memory_takes_half_of_what_it_was_fi
     """Three samples, filled up to eight, of which four fit: four are tried next, and not one."""
     compiled = load_inpainter(folder, steps=2, compile=True, micro_batch=8)
     pretend_gpu(compiled, 8)
-    limit_memory(compiled, 4, monkeypatch)
     with torch.compiler.set_stance("force_eager"):
+        compiled.warm_up((48, 64), 8)
+        limit_memory(compiled, 4, monkeypatch)
         compiled(*scenes(3), generators(0, 1, 2))
         assert (compiled.micro_batch.size, compiled.micro_batch.lowered) == (4, 1)
         compiled(*scenes(1), generators(0))

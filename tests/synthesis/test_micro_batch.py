@@ -27,9 +27,12 @@ def joined(parts):
     return list(chain.from_iterable(parts))
 
 
-def test_parts_cover_all_samples_in_order():
+def test_parts_cover_all_samples_in_order_and_are_of_one_size_or_nearly():
     batch, seen = MicroBatch("network", 3, GPU, "cure"), []
     assert joined(batch.run(limited(3, seen), 8)) == list(range(8)) and seen == [3, 3, 2]
+    seen.clear()
+    assert joined(batch.run(limited(3, seen), 4)) == list(range(4)) and seen == [2, 2]
+    assert [batch.evenly(total) for total in (1, 3, 4, 7, 9)] == [1, 3, 2, 3, 3]
     assert batch.run(limited(3, seen), 0) == []
 
 
@@ -40,8 +43,8 @@ def test_on_the_cpu_it_is_one():
 def test_what_does_not_fit_is_halved_for_the_rest_of_the_run_and_said_once(caplog):
     batch, seen = MicroBatch("network", 8, GPU, "cure"), []
     with caplog.at_level(logging.WARNING, "zsdata"):
-        assert joined(batch.run(limited(3, seen), 9)) == list(range(9))
-        assert seen == [8, 4, 2, 2, 2, 2, 1] and (batch.size, batch.lowered) == (2, 2)
+        assert joined(batch.run(limited(3, seen), 15)) == list(range(15))
+        assert seen == [8, 4, 2, 2, 2, 2, 2, 2, 2, 1] and (batch.size, batch.lowered) == (2, 2)
         seen.clear()
         batch.run(limited(3, seen), 4)
     assert seen == [2, 2] and len(caplog.records) == 2

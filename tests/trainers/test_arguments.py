@@ -52,9 +52,6 @@ def test_networks_take_their_options(tar, tmp_path):
     )
     assert told.provenance() == expected.provenance() != plain.provenance()
     assert [record["id"] for record in told.provenance()["inpaint"]] == [str(pipeline), str(tiny)]
-    for which, name in (("depth", str(depth)), ("inpaint", str(pipeline))):
-        with pytest.raises(ValueError, match=f"{name}.* is a folder, which has no revisions"):
-            open_stream(parsed("--sources", tar, *model, f"--{which}-revision", "v1"))
 
 
 @pytest.mark.parametrize(
@@ -62,7 +59,7 @@ def test_networks_take_their_options(tar, tmp_path):
     [
         (("--inpaint-steps", "4"), "belongs to a diffusion network; --inpaint is builtin"),
         (("--depth-resolution", "518"), "--depth-resolution belongs to a depth network; --depth is builtin"),
-        (("--depth", "stored", "--depth-revision", "v1"), "--depth-revision belongs to a depth network; --depth is stored"),
+        (("--depth", "stored", "--depth-resolution", "518"), "--depth-resolution belongs to a depth network; --depth is stored"),
         (("--depth", "owner/name", "--depth-resolution", "large"), "resolution"),
         (("--inpaint", "/no/such/folder"), '"/no/such/folder" is neither a folder nor a Hub id'),
         (("--depth", "depth-anything/Depth-Anything-V2-Large-hf", "--commercial-safe"), "no commercial use"),

@@ -711,10 +711,6 @@ def test_the_command_tunes_on_two_ranks_as_on_one(pipeline, photos, things, tmp_
         ([], "nothing to learn from: name --photos or --datasets"),
         (["--photos", "nowhere.tar"], "nowhere.tar"),
         (["--depth-cache", "depth"], "--depth-cache keeps the depth of photos; name --photos, or leave it out"),
-        (
-            ["--photos", "photos.tar", "--depth-revision", "v1"],
-            "--depth-revision belongs to a depth network of the Hub; --depth is builtin",
-        ),
         (["--datasets", "kitti=somewhere"], "takes KIND=FOLDER with one of sceneflow-clean"),
         (["--datasets", "tartanair=nowhere"], "no folder nowhere"),
         (["--datasets", "vkitti2=tests", "--pipeline", "nowhere"], "no pair of vkitti2 in tests"),

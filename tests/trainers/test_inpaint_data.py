@@ -288,7 +288,7 @@ def test_damaged_files_of_a_pair_are_told_apart(tmp_path):
     cases = {
         "damaged map: it holds 96 of the 960 bytes of 20 x 12 values": {truth: files[truth][: -(960 - 96)]},
         "sizes differ: the disparity is 19 x 12, the left image 20 x 12": {truth: pfm(DISPARITY[:, 1:])},
-        "sparse truth: 0 % of the disparity map is known": {truth: pfm(0 * DISPARITY)},
+        "no truth: nothing of the disparity map is known": {truth: pfm(0 * DISPARITY)},
         "empty file": {"FlyingThings3D/frames_cleanpass/TRAIN/A/0000/right/0006.png": b""},
     }
     for message, change in cases.items():
@@ -365,6 +365,12 @@ def test_a_sign_that_is_the_direction_of_the_shift_counts_for_nothing(tmp_path, 
     known = StereoTars(write_tar(tmp_path / "a.tar", members)).read(0).right_disparity
     assert known is not None and np.isnan(known[1, :4]).all() and np.isnan(known).sum() == 4
     assert np.allclose(known[2:], RIGHT_DISPARITY[2:], rtol=1e-6)
+
+
+def test_a_map_of_one_value_below_0_knows_nothing(tmp_path):
+    members = tar_members("0001") | {"0001.disp_right.pfm": pfm(np.full_like(DISPARITY, -1))}
+    with pytest.raises(BadPhoto, match="no truth: nothing of the right disparity map is known"):
+        StereoTars(write_tar(tmp_path / "a.tar", members)).read(0)
 
 
 def test_what_is_below_0_among_positive_disparities_is_unknown(tmp_path):

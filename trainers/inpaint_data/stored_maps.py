@@ -25,13 +25,15 @@ class StereoFrame(NamedTuple):
     right_disparity: np.ndarray | None  # the same of the right view: right (x, y) is left (x + disparity, y)
 
     def checked(self) -> StereoFrame:
-        """Itself; raises BadPhoto where its parts differ in size or a truth is sparse."""
+        """Itself; raises BadPhoto where its parts differ in size or a truth is empty or sparse."""
         for name, part in (("right image", self.right), ("disparity", self.disparity), ("right disparity", self.right_disparity)):
             if part is not None and part.shape[:2] != self.left.shape[:2]:
                 height, width = self.left.shape[:2]
                 raise BadPhoto(f"sizes differ: the {name} is {part.shape[1]} x {part.shape[0]}, the left image {width} x {height}")
         for name, disparity in (("disparity map", self.disparity), ("right disparity map", self.right_disparity)):
             if disparity is not None and (known := np.isfinite(disparity).mean()) < LEAST_KNOWN:
+                if not known:
+                    raise BadPhoto(f"no truth: nothing of the {name} is known")
                 raise BadPhoto(f"{SPARSE_TRUTH}: {int(100 * known)} % of the {name} is known, half is needed")
         return self
 

@@ -5,8 +5,8 @@
     KEY.disp_right.EXT             the same of the right view, where it is known
 
 0, inf and NaN mean that nobody knows; of each map at least half is to be known. The sign of a map that is nowhere above 0 is the direction
-of the shift, as some releases of Scene Flow write it for the right view, and counts for nothing; in other maps what is below 0 is unknown.
-Nothing is unpacked and nothing in a tar is ever run.
+of the shift, as some releases of Scene Flow write it for the right view, and counts for nothing, unless all of it is one value, such as -1;
+in other maps what is below 0 is unknown. Nothing is unpacked and nothing in a tar is ever run.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class StereoTars:
         extension = self._pairs[index].parts[name].extension
         stored = decode_map(self._bytes(index, name), extension) / (PNG_DIVISOR if extension == "png" else 1)
         stored = np.where(np.isfinite(stored), stored, 0)
-        if not (stored > 0).any():
+        if not (stored > 0).any() and len(np.unique(stored[stored < 0])) > 1:  # one value, such as -1, stands for what nobody knows
             stored = -stored
         return np.where(stored > 0, stored, np.nan).astype(np.float32)
 

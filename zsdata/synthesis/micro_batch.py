@@ -44,24 +44,24 @@ class WarmUp(NamedTuple):
         return f"{self.what}: micro-batch {self.micro_batch}{peak}, warm after {self.seconds:.1f} s"
 
 
-def say_warm_up(ready: Sequence[WarmUp], device: torch.device, photo: tuple[int, int] | None = None) -> str:
+def say_warm_up(ready: Sequence[WarmUp], device: torch.device, photos: int = 0) -> str:
     """What the networks of a stream said of their warm-up, a line each; and how much memory of the device they take in all, where they
-    work on whole photos for those of at most this (height, width)."""
+    work on whole photos for those that are as large as the first so many."""
     lines = [f"zsdata on {device}: {said}" for said in ready]
     activations = [said.peak_bytes - said.weights for said in ready if said.peak_bytes is not None]
     if activations:
         peak = sum(said.weights for said in ready) + max(activations)  # weights stay, activations come one after another
-        photos = "" if photo is None else f", for photos of up to {photo[0]}x{photo[1]}"
-        lines.append(f"zsdata on {device}: the stream takes at most {peak / GIB:.2f} GiB beside training{photos}")
+        like = f" while no photo is larger than the first {photos}" if photos else ""
+        lines.append(f"zsdata on {device}: the stream takes at most {peak / GIB:.2f} GiB beside training{like}")
     return "\n".join(lines)
 
 
 class MicroBatch:
-    """Runs work over many samples in parts; a part that does not fit into memory makes all later parts smaller.
+    """Runs work over many samples in parts of equal size; a part that does not fit into memory makes all later parts smaller.
 
     Args:
         what: for messages, such as "depth network".
-        size: samples at once, 1 or more; on the CPU 1 is used instead.
+        size: the most samples at once, 1 or more; on the CPU 1 is used instead.
         device: where the work is done.
         cure: ends the sentence "...: " in the error that is raised when one sample alone does not fit.
 
@@ -75,11 +75,16 @@ class MicroBatch:
         self.choose(size)
 
     def choose(self, size: int) -> None:
-        """So many samples at once from now on; fewer where memory has run out before."""
+        """At most so many samples at once from now on; fewer where memory has run out before."""
         self.size = min(size, self._most)
 
+    def evenly(self, total: int) -> int:
+        """How many samples the largest part of `total` has: there are no more parts than needed, and they differ by one at most."""
+        parts = -(-total // self.size)
+        return -(-total // parts)
+
     def run(self, work: Callable[[slice], Made], total: int, rows: Callable[[int], int] = int) -> list[Made]:
-        """`work(part)` for parts of at most `size` that cover range(total), in order.
+        """`work(part)` for parts that cover range(total), in order.
 
         Args:
             rows: how many samples the work makes of a part of so many: more, where it is filled up.
@@ -90,7 +95,7 @@ class MicroBatch:
         made: list[Made] = []
         start = 0
         while start < total:
-            stop = min(start + self.size, total)
+            stop = start + self.evenly(total - start)
             failed = None
             try:
                 made.append(work(slice(start, stop)))

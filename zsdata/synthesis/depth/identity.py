@@ -33,8 +33,7 @@ def depth_identity(depth: str | os.PathLike[str] | DepthNetwork | Callable[..., 
     - A Hub id: the id, and the commit that it stands for in the local Hub cache. Nothing is downloaded: an id that is not there yet is an
       error, because maps of an unknown commit could not be told from those of the next one.
     - A `DepthNetwork`: its folder or Hub id, and the options that change its output.
-    - What `load_depth` loaded: as the `DepthNetwork` that it was loaded from.
-    - Another callable: its attribute `cache_name`, which whoever changes the callable also changes. No name is guessed: code and weights
+    - A callable: its attribute `cache_name`, which whoever changes the callable also changes. No name is guessed: code and weights
       of a callable cannot be seen from outside, and wrong depth would come out of the cache without a word.
 
     Raises:
@@ -51,9 +50,6 @@ def depth_identity(depth: str | os.PathLike[str] | DepthNetwork | Callable[..., 
         return f"{_name_identity(depth.name, depth.revision)}{said}"
     if callable(depth):
         name = getattr(depth, "cache_name", None)
-        loaded = getattr(depth, "pinned", None)
-        if name is None and isinstance(loaded, DepthNetwork):
-            return depth_identity(loaded)
         if not isinstance(name, str) or not name.strip():
             raise ValueError(
                 f"depth_cache needs to know which estimator {depth!r} is; got cache_name {name!r}. Give it a name that changes with its "
@@ -61,7 +57,7 @@ def depth_identity(depth: str | os.PathLike[str] | DepthNetwork | Callable[..., 
             )
         return f"callable {name}"
     name = os.fspath(depth)
-    return f"builtin {BUILTIN_VERSION}" if name == "builtin" else _name_identity(name, None)
+    return f"builtin {BUILTIN_VERSION}" if name == "builtin" else depth_identity(DepthNetwork(name))
 
 
 def _name_identity(name: str, revision: str | None) -> str:
@@ -77,10 +73,10 @@ def hub_commit(name: str, revision: str | None = None) -> str:
     except ValueError as error:
         raise ValueError(f'depth="{name}" is neither a folder nor a Hub id ("owner/name"): {error}') from error
     if not isinstance(config, str):
-        wanted = "" if revision is None else f', revision="{revision}"'
+        wanted = "" if revision is None else f" --revision {revision}"
         raise FileNotFoundError(
-            f'depth="{name}" is no folder, and the local Hub cache does not have it: depth_cache needs to know its commit. '
-            f"Download it first: python -c 'import zsdata; zsdata.load_depth(\"{name}\"{wanted})'"
+            f'depth="{name}" is no folder, and the local Hub cache does not have it, so that nothing tells its commit. Download it there '
+            f"first: hf download {name}{wanted}; of HF_HUB_CACHE and TRANSFORMERS_CACHE set one alone"
         )
     return os.path.basename(os.path.dirname(config))
 

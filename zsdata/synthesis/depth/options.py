@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from zsdata.field_types import check_types
+from zsdata.synthesis.model_name import split_revision
 from zsdata.synthesis.precision import check_dtype
 
 STORED = "stored"  # the name of depth that lies beside the photos and is read with them
@@ -17,7 +18,7 @@ class DepthNetwork:
     """A depth network of transformers; plain values, so that it travels to workers and into digests. `load_depth` makes it a callable.
 
     Args:
-        name: a Hub id, such as "depth-anything/Depth-Anything-V2-Small-hf", or a local folder.
+        name: a Hub id, such as "depth-anything/Depth-Anything-V2-Small-hf", or a local folder; "owner/name@revision" gives both.
         resolution: the short side of the network's input in pixels, rounded to whole patches; "native" is the photo's own size; None is
             the size that the network's folder states.
         revision: branch, tag or commit of a Hub id; a folder has none.
@@ -41,6 +42,8 @@ class DepthNetwork:
 
     def __post_init__(self) -> None:
         check_types(self)
+        for field, value in zip(("name", "revision"), split_revision(self.name, self.revision), strict=True):
+            object.__setattr__(self, field, value)  # frozen for others
         in_pixels = isinstance(self.resolution, int) and not isinstance(self.resolution, bool) and self.resolution >= 1
         if not (self.resolution is None or self.resolution == "native" or in_pixels):
             raise ValueError(f'resolution is the short side in pixels, "native" or None; got {self.resolution!r}')

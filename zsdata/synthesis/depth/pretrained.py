@@ -19,7 +19,7 @@ from torch import Tensor
 
 from zsdata.synthesis.depth import DepthEstimator, as_network
 from zsdata.synthesis.depth.identity import pinned
-from zsdata.synthesis.depth.maps import depth_maps
+from zsdata.synthesis.depth.maps import DepthMaps, depth_maps
 from zsdata.synthesis.depth.model_folder import check_weights
 from zsdata.synthesis.depth.options import DepthNetwork
 from zsdata.synthesis.depth.preprocessing import Preprocessing, read_preprocessing
@@ -105,7 +105,7 @@ class PretrainedDepth:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Another process loads it anew: transformers and `compile` hang functions on a network that do not travel."""
-        return PretrainedDepth, (self.pinned, self.device)
+        return type(self), (self.pinned, self.device)
 
     def prepare(self, images: Tensor) -> Tensor:
         """The first half: photos to the network's input.
@@ -191,25 +191,23 @@ class PretrainedDepth:
         return depth, mirrored
 
     def warm_up(self, size: tuple[int, int], samples: int | None = None) -> WarmUp:
-        """Runs one micro-batch of grey photos of this (height, width), and says how much memory that takes.
+        """Estimates depth of grey photos of this (height, width), and says how much memory that takes, the maps of all of them too.
 
         Args:
             size: height and width of the photos.
-            samples: the most photos that will come at once, each with its mirror image; None is not known.
+            samples: the most photos that will come at once, each with its mirror image; None is not known, and one micro-batch is tried.
         """
-        images = self.micro_batch.size if samples is None else min(self.micro_batch.size, 2 * samples)
+        photos = -(-self.micro_batch.size // 2) if samples is None else samples
         grey = self.prepare(torch.full((1, 3, *size), 127, dtype=torch.uint8))
-        photos = -(-images // 2)  # each is two images
 
-        def work() -> None:
-            for maps in self.predict_mirrored([grey] * photos, [size] * photos):
-                depth_maps(*maps)
+        def work() -> list[DepthMaps]:
+            return [depth_maps(*maps) for maps in self.predict_mirrored([grey] * photos, [size] * photos)]
 
         peak, seconds = self.micro_batch.measure(work)
-        what = f"depth {self.network.name} at {grey.shape[-2]}x{grey.shape[-1]} for photos of {size[0]}x{size[1]}, {self.dtype}"
+        what = f"depth {self.network.name} at {grey.shape[-2]}x{grey.shape[-1]} for {photos} photos of {size[0]}x{size[1]}, {self.dtype}"
         weights = weight_bytes(self._network)
-        size_in_use = min(self.micro_batch.size, 2 * photos)
-        return WarmUp(what, size_in_use, None if peak is None else peak + weights, weights, seconds)
+        at_once = self.micro_batch.evenly(2 * photos)
+        return WarmUp(what, at_once, None if peak is None else peak + weights, weights, seconds)
 
     def _run(self, inputs: Tensor) -> Tensor:
         """uint8 [B, 3, h, w] on the device to inverse depth, float32 [B, 1, h', w']."""

