@@ -45,6 +45,21 @@ def test_ranks_share_an_epoch_without_overlap_and_in_equal_steps(tar, world_size
     assert indices(parts[1][:1]) == [(0, 2), (0, 3)]
 
 
+def test_a_loader_asks_the_launcher_which_rank_it_is(tar, monkeypatch):
+    """`torchrun` and `accelerate launch` say it in the environment, before any process group is there."""
+    expected = [list(open_stream(tar).loader(2, rank=rank, world_size=3)) for rank in range(3)]
+    for rank in range(3):
+        monkeypatch.setenv("RANK", str(rank))
+        monkeypatch.setenv("WORLD_SIZE", "3")
+        loader = open_stream(tar).loader(2)
+        assert (loader.rank, loader.world_size) == (rank, 3) and indices(loader) == indices(expected[rank])
+        assert open_stream(tar).loader(2, rank=0, world_size=1).world_size == 1
+    monkeypatch.setenv("WORLD_SIZE", "")
+    assert open_stream(tar).loader(2).world_size == 1
+    with pytest.raises(ValueError, match="rank and world_size are given together or not at all; got rank=1, world_size=None"):
+        open_stream(tar).loader(2, rank=1)
+
+
 @pytest.mark.parametrize("workers", [0, 2])
 @pytest.mark.parametrize("stop", range(1, 8))
 def test_resume_gives_the_batches_that_the_unbroken_run_gives(tar, workers, stop):

@@ -12,6 +12,7 @@ from torch.utils.data import DataLoader
 from tests.scenes import grey_fill, jpeg, layered_depth, photo, photo_tar, png, write_tar
 from zsdata import AdaptiveDisparity, AugmentConfig, ImageSource, StereoBatch, UniformDisparity, ZeroStereoStream
 from zsdata.quality import QualityGate
+from zsdata.seeding import rng
 from zsdata.synthesis.view import ViewConfig
 
 SIZE = (64, 96)
@@ -240,6 +241,16 @@ def test_pairs_that_teach_nothing_are_counted_and_replaced_by_the_same_ones_ever
     with open_stream(tar, depth_placement=placement, **options).loader(3, num_workers=workers) as loader:
         assert by_index(batch[i] for batch in loader for i in range(3)) == by_index(plain)
         assert loader.stats()["rejected"] == {"too many holes": len(refused)}
+
+
+def test_what_stands_in_for_a_pair_draws_anew(tar):
+    """What was refused may be the draw: a disparity that leaves nothing of any photo."""
+    drawn = [
+        (pair.meta, AdaptiveDisparity().draw_scale(rng(0, 0, pair.meta["pair"], "disparity"), 160))
+        for pair in open_stream(tar, seed=0, depth=CountingDepth(), quality=QualityGate(max_hole_share=0.16))
+    ]
+    assert any(meta["replaced"] for meta, _ in drawn)
+    assert all((meta["disparity_scale"] == first) == (not meta["replaced"]) for meta, first in drawn)
 
 
 def test_the_largest_disparity_is_the_drawn_share_of_the_photos_width(tar):

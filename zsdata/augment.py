@@ -10,7 +10,7 @@ Drawn, each sample from its own generator, and applied in this order; disparity,
 4. both images to grey; 5. right image: occlusion boxes of its mean colour (RAFT-Stereo's eraser).
 
 Scale and stretch belong to the view, which is drawn before the pair is made. Light comes before colour processing, and noise after
-blur, as in a camera.
+blur, as in a camera; the published training blurs its noise too, so that in the half of the pairs that is blurred its noise is weaker.
 """
 
 from __future__ import annotations

@@ -147,7 +147,7 @@ def feed(
             must be short.
     """
     device = torch.device(device)
-    with stream.loader(batch_size, num_workers=workers, device=device) as loader:
+    with stream.loader(batch_size, num_workers=workers, device=device, rank=0, world_size=1) as loader:
         arriving = chain.from_iterable(repeat(loader))  # epoch after epoch
         for batch in islice(arriving, _warm_up(workers)):
             after_batch(batch)
@@ -183,7 +183,7 @@ def split_stages(run: Run, device: torch.device) -> tuple[dict[str, float], dict
 
 def fill_depth_cache(stream: ZeroStereoStream, workers: int, samples: int) -> None:
     """Makes the stream's first samples, so that its depth cache knows their photos; `leave_holes` spares it the inpainting."""
-    with stream.loader(1, num_workers=workers) as loader:
+    with stream.loader(1, num_workers=workers, rank=0, world_size=1) as loader:
         for _ in Progress(islice(loader, samples), desc="filling the depth cache", total=samples, unit="pair", disable=None):
             pass
 

@@ -87,7 +87,7 @@ def export_pairs(
     with _FileList(folder) as file_list:
         there = file_list.take_up(places)
         with (
-            stream.loader(batch_size=1, num_workers=workers) as loader,
+            stream.loader(batch_size=1, num_workers=workers, rank=0, world_size=1) as loader,
             Progress(total=count, initial=there, desc="exporting", unit="pair", disable=None) as bar,
         ):
             for pair in _pairs(loader, places[there:]):

@@ -35,7 +35,7 @@ class Synthesis:
     depth: DepthEstimator | None  # None: every draft has its depth
     recipe: Recipe
     worker: Worker  # of the same recipe: draws what stands in for a pair that the quality gate refuses
-    _last: dict[tuple[str, str], DepthMaps] = field(default_factory=dict)  # of the last photo: its next view may begin the next batch
+    _last: dict[tuple[str, int], DepthMaps] = field(default_factory=dict)  # of the last photo: its next view may begin the next batch
 
     def __call__(self, drafts: Drafts, device: torch.device, meter: Meter) -> Prepared:
         """The pairs of a batch of drafts, on the device; a photo's depth is estimated once, however many views follow one another."""
@@ -45,16 +45,16 @@ class Synthesis:
         while len(made) < len(drawn):
             missing = {place: draft for place, draft in enumerate(drawn) if place not in made}
             with meter.stage("depth"):
-                unknown = {_photo(draft): draft for draft in missing.values() if draft.depth is None and _photo(draft) not in known}
+                unknown = {draft.identity: draft for draft in missing.values() if draft.depth is None and draft.identity not in known}
                 known.update(self._estimate(unknown, device))
             for place, draft in missing.items():
-                depth = draft.depth if draft.depth is not None else known[_photo(draft)]
+                depth = draft.depth if draft.depth is not None else known[draft.identity]
                 try:
                     made[place] = self._make(draft, depth, device, meter)
                 except BadPhoto as fault:
                     drawn[place] = self.worker.instead(draft, fault.reason)
         self._last.clear()
-        self._last.update({photo: depth for photo, depth in known.items() if photo == _photo(drawn[-1])})
+        self._last.update({photo: depth for photo, depth in known.items() if photo == drawn[-1].identity})
         pairs = Prepared.stack([made[place] for place in range(len(drawn))])
         meta = [{**pairs.meta[row], "index": sample["index"]} for row, sample in zip(drafts.rows, drafts.meta, strict=True)]
         rejected = [reject for draft in drawn for reject in draft.rejected]
@@ -80,14 +80,14 @@ class Synthesis:
             return make(draft, depth, self.recipe.inpainter_needs, self.recipe.synthesis, self.recipe.gate, meter)
 
     @torch.no_grad()
-    def _estimate(self, drafts: dict[tuple[str, str], Draft], device: torch.device) -> dict[tuple[str, str], DepthMaps]:
+    def _estimate(self, drafts: dict[tuple[str, int], Draft], device: torch.device) -> dict[tuple[str, int], DepthMaps]:
         """Depth of the photos of these drafts: by a network, whose first half the workers did, all in one go; otherwise one by one."""
         if self.depth is None:
             return {}
         config = self.recipe.synthesis
         photos = [draft.photo.to(device, non_blocking=True) for draft in drafts.values() if draft.photo is not None]
         if self.recipe.preprocessing is not None:
-            with _naming_photos(drafts):
+            with _naming_photos(drafts.values()):
                 maps = predict_depth(self.depth, photos, [tuple(draft.meta["photo_size"]) for draft in drafts.values()], config)
         else:
             maps = (estimate_depth(self.depth, photo.float(), config) for photo in photos)
@@ -101,19 +101,15 @@ class Synthesis:
         return dict(zip(drafts, found, strict=True))
 
 
-def _photo(draft: Draft) -> tuple[str, str]:
-    return draft.meta["shard"], draft.meta["key"]
-
-
 @contextmanager
-def _naming_photos(photos: Iterable[tuple[str, str]]) -> Iterator[None]:
+def _naming_photos(drafts: Iterable[Draft]) -> Iterator[None]:
     """Errors of work on many photos at once say which they are. One photo that memory does not hold is the device's affair."""
     try:
         yield
     except MemoryError:
         raise
     except Exception as error:
-        listed = ", ".join(f'"{key}" in {shard}' for shard, key in photos)
+        listed = ", ".join(f'"{draft.meta["key"]}" in {draft.meta["shard"]}' for draft in drafts)
         raise RuntimeError(f"the depth network failed: {error} The photos that it was given: {listed}") from error
 
 

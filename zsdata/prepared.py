@@ -63,6 +63,7 @@ class Draft:
     """A pair before its depth is known, or before it is used.
 
     Attributes:
+        identity: of the photo: its manifest's digest and its number there.
         photo: uint8 [1, 3, h, w], the whole photo, or what the depth network's `prepare` made of it; None where its depth is known.
         depth: of at least the rows that the view shows; None where it is still to be estimated.
         digest: names the photo in the depth cache; "" without one.
@@ -71,6 +72,7 @@ class Draft:
         context: `background`, uint8, where the inpainter needs it.
     """
 
+    identity: tuple[str, int]
     photo: Tensor | None
     depth: DepthMaps | None
     digest: str

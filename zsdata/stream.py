@@ -21,6 +21,7 @@ from zsdata.augment import AugmentConfig
 from zsdata.faults import FailureBudget, FaultLog
 from zsdata.finish import Finisher, Synthesis
 from zsdata.hub import hub_models
+from zsdata.launch import launched_as
 from zsdata.licences import fetch_cards, model_records, require_commercial, warn_of_unknown_licences
 from zsdata.loader import SAMPLE_TIMEOUT_SECONDS, StereoLoader
 from zsdata.meter import Meter
@@ -260,8 +261,8 @@ class ZeroStereoStream(IterableDataset):
         *,
         num_workers: int = 0,
         device: str | torch.device = "cpu",
-        rank: int = 0,
-        world_size: int = 1,
+        rank: int | None = None,
+        world_size: int | None = None,
         micro_batch: int | None = None,
         multiprocessing_context: str | None = None,
         timeout_seconds: float = SAMPLE_TIMEOUT_SECONDS,
@@ -273,7 +274,8 @@ class ZeroStereoStream(IterableDataset):
             batch_size: pairs per batch and rank.
             num_workers: processes on the CPU; 0 makes the pairs in this one.
             device: where the batches are finished and given out.
-            rank, world_size: which share of every global batch this process is given.
+            rank, world_size: which share of every global batch this process is given. None asks torch.distributed, or the launcher that
+                started it (torchrun, accelerate launch); without either it is all of them.
             micro_batch: pairs that are inpainted at once; changes memory and speed, and the pictures by no more than rounding. None: all
                 that have holes, or as many as a diffusion network finds to fit into the device's memory.
             multiprocessing_context: "fork", "forkserver" or "spawn"; None is Python's own choice.
@@ -287,6 +289,9 @@ class ZeroStereoStream(IterableDataset):
         if self._recipe.size is None and batch_size != 1:
             raise ValueError(f"whole photos (size=None) differ in size and come one at a time: batch_size is 1; got {batch_size}")
         device = torch.device(device)
+        if (rank is None) != (world_size is None):
+            raise ValueError(f"rank and world_size are given together or not at all; got rank={rank}, world_size={world_size}")
+        rank, world_size = launched_as() if rank is None or world_size is None else (rank, world_size)
         on_device = self._depth_placement == "device"
         if self._depth_placement == "auto":
             on_device = self._depth_elsewhere or (device.type != "cpu" and as_network(self._pinned_depth) is not None)

@@ -168,13 +168,17 @@ class Worker:
 
     def _draft(self, sources: SourceSet, choice: Choice, meta: dict[str, Any], rejected: list[Rejected]) -> Draft:
         recipe, meter = self._recipe, Meter()
-        place = recipe.seed, meta["epoch"], meta["pair"]
+        spare = f" {len(rejected)}" if rejected else ""  # draws anew: it may be what was drawn that was refused
+
+        def draw(purpose: str) -> np.random.Generator:
+            return rng(recipe.seed, meta["epoch"], meta["pair"], purpose + spare)
+
         photo = self._open(sources, choice, meter)
-        scale = recipe.disparity.draw_scale(rng(*place, "disparity"), photo.size[1])
+        scale = recipe.disparity.draw_scale(draw("disparity"), photo.size[1])
         if recipe.size is None:
             view = whole_view(photo.size)
         else:
-            view = draw_view(photo.size, recipe.size, rng(*place, "view"), recipe.view, scale)
+            view = draw_view(photo.size, recipe.size, draw("view"), recipe.view, scale)
         with meter.stage("decode"):
             pixels = photo.pixels(view.reduction)
         with meter.stage("view"):
@@ -186,7 +190,7 @@ class Worker:
         if "background" in recipe.inpainter_needs:
             with meter.stage("background"):
                 size = view.height, view.width - view.margin
-                context["background"] = _planes(self._background(sources, choice, rng(*place, "background"), photo, size))
+                context["background"] = _planes(self._background(sources, choice, draw("background"), photo, size))
         meta = {
             **meta,
             "photo_size": list(photo.size),
@@ -200,7 +204,8 @@ class Worker:
         if depth is None:
             with meter.stage("prepare"):
                 unseen = self._for_the_device(photo)
-        return Draft(unseen, depth, digest, left, view, scale, context, meta, list(rejected), meter.seconds)
+        identity = sources.manifests[choice.source].digest, choice.member
+        return Draft(identity, unseen, depth, digest, left, view, scale, context, meta, list(rejected), meter.seconds)
 
     def _for_the_device(self, photo: _Photo) -> Tensor:
         pixels = _planes(photo.pixels()).unsqueeze(0)

@@ -73,7 +73,8 @@ class Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         act = self.server.act_for(Request(self.path, dict(self.headers), self.client_address[1]))
-        file = self.server.files.get(self.path.partition("?")[0].lstrip("/").rpartition("127.0.0.1/")[2])
+        path = self.path.lstrip("/").rpartition("127.0.0.1/")[2]
+        file = self.server.files.get(path) or self.server.files.get(path.partition("?")[0])
         if file is None and act is serve:
             answer(404)(self, File(b"", {}))
         else:

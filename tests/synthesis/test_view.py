@@ -44,8 +44,20 @@ def test_a_reduced_photo_still_has_a_pixel_for_every_pixel_of_the_view(case):
 def test_small_scales_are_reduced_and_the_usual_ones_are_not():
     reductions = {draw_view((1536, 2048), (384, 512), np.random.default_rng(i), SMALL_SCALES, 0.1).reduction for i in range(200)}
     assert reductions == {1, 2, 4}
-    usual = {draw_view((1536, 2048), (384, 512), np.random.default_rng(i), ViewConfig(), 0.1).reduction for i in range(200)}
+    usual = {draw_view((768, 1024), (384, 512), np.random.default_rng(i), ViewConfig(), 0.1).reduction for i in range(200)}
     assert usual == {1}
+
+
+@pytest.mark.parametrize("crop", [(384, 512), (512, 512)])
+def test_a_photo_of_many_pixels_shows_as_much_as_one_of_two_crops_width(crop):
+    """Its disparities would be several times as large in the same crop otherwise."""
+    for seed in range(50):
+        known, large = (draw_view(size, crop, np.random.default_rng(seed), ViewConfig(), 0.1) for size in ((768, 1024), (3072, 4096)))
+        assert large.scale_x * 4096 == pytest.approx(known.scale_x * 1024, rel=0.02)
+        whole = draw_view((3072, 4096), crop, np.random.default_rng(seed), ViewConfig(max_width=8), 0.1)
+        assert whole.scale_x == pytest.approx(known.scale_x, rel=0.02)
+    with pytest.raises(ValueError, match=r"max_width is a number of crops, 1 or more; got 0\.5"):
+        ViewConfig(max_width=0.5)
 
 
 @pytest.mark.parametrize("orientation", [1, 3, 6])

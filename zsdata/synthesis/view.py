@@ -17,8 +17,14 @@ from zsdata.field_types import check_types
 
 @dataclass(frozen=True, kw_only=True)
 class ViewConfig:
-    """How a crop is cut from a photo; scales are exponents of two, as in RAFT-Stereo's spatial augmentation."""
+    """How a crop is cut from a photo; scales are exponents of two, as in RAFT-Stereo's spatial augmentation.
 
+    Disparity goes by the photo's width: of a photo of 12 megapixels in its own pixels, a crop of 512 columns would show disparities of
+    several hundred pixels, and mostly what one camera alone sees. So a photo that is wider than `max_width` crops is taken for one that
+    is as wide as these; those of the published training are not.
+    """
+
+    max_width: float = 2.0
     min_scale: float = -0.2
     max_scale: float = 0.4
     max_stretch: float = 0.2  # width and height each differ from the common scale by up to this exponent
@@ -27,6 +33,8 @@ class ViewConfig:
 
     def __post_init__(self) -> None:
         check_types(self)
+        if not self.max_width >= 1:
+            raise ValueError(f"max_width is a number of crops, 1 or more; got {self.max_width}")
         if not -4 <= self.min_scale <= self.max_scale <= 4:
             raise ValueError(f"scales are exponents of two, -4 <= min_scale <= max_scale <= 4; got {self.min_scale}..{self.max_scale}")
         if not 0 <= self.max_stretch <= 2:
@@ -80,7 +88,8 @@ def draw_view(
     stretched = draws[1] < config.stretch_probability
     stretch_x, stretch_y = (config.max_stretch * (2 * draw - 1) if stretched else 0.0 for draw in draws[2:4])
 
-    scale = max(2**exponent, height / photo_height, width / photo_width)  # one scale for both sides: a small photo keeps its aspect
+    scale = min(1.0, config.max_width * width / photo_width) * 2**exponent
+    scale = max(scale, height / photo_height, width / photo_width)  # one scale for both sides: a small photo keeps its aspect
     window_width = min(photo_width, max(1, round(width / (scale * 2**stretch_x))))
     window_height = min(photo_height, max(1, round(height / (scale * 2**stretch_y))))
     reduction = _reduction(photo_size, crop_size, (window_height, window_width))
