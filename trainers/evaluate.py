@@ -57,6 +57,7 @@ def evaluate(
     total: int | None = None,
     below_px: Sequence[float] = (),
     progress: bool = True,
+    out_of_memory: str = OUT_OF_MEMORY,
 ) -> list[dict[str, Any]]:
     """Scores of `predict` on each pair.
 
@@ -68,6 +69,7 @@ def evaluate(
         total: how many pairs, for the progress bar, where `pairs` does not know.
         below_px: see `trainers.scores.score`.
         progress: shows a bar.
+        out_of_memory: what helps, for the error.
     Returns:
         For each pair {"name", "group", "seconds"} and the scores by region of `trainers.scores.score`. `mean_scores` sums them up.
     Raises:
@@ -78,7 +80,7 @@ def evaluate(
     for pair in Progress(pairs, total=total, desc="evaluate", unit="pair", disable=not progress):
         left, right = (torch.from_numpy(image).to(device).permute(2, 0, 1)[None].float() for image in (pair.left, pair.right))
         begin = time.perf_counter()
-        prediction = _predict_or_say_what_helps(predict, left, right, pair.name)
+        prediction = _predict_or_say_what_helps(predict, left, right, pair.name, out_of_memory)
         seconds = time.perf_counter() - begin
         if prediction.shape != (1, 1, *pair.disparity.shape):
             raise ValueError(f"{pair.name}: predicted {list(prediction.shape)} for images of {list(pair.disparity.shape)}")
@@ -93,14 +95,14 @@ def evaluate(
     return results
 
 
-def _predict_or_say_what_helps(predict: Predict, left: Tensor, right: Tensor, name: str) -> Tensor:
+def _predict_or_say_what_helps(predict: Predict, left: Tensor, right: Tensor, name: str, out_of_memory: str) -> Tensor:
     try:
         return predict(left, right).cpu()  # the copy waits for the device
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, (MemoryError, torch.OutOfMemoryError)) and "allocate memory" not in str(error):
             raise
         size = f"{left.shape[-1]} x {left.shape[-2]} px"
-        raise MemoryError(f"{name}, {size}, does not fit into the memory of {left.device}: {OUT_OF_MEMORY}") from error
+        raise MemoryError(f"{name}, {size}, does not fit into the memory of {left.device}: {out_of_memory}") from error
 
 
 def _paint(folder: Path, pair: StereoPair, prediction: np.ndarray) -> None:
@@ -116,24 +118,27 @@ def _paint(folder: Path, pair: StereoPair, prediction: np.ndarray) -> None:
         (folder / f"{pair.name}_{kind}.png").write_bytes(content.tobytes())
 
 
-def open_dataset(dataset: str, root: Path | None = None, variant: str | None = None) -> tuple[Iterator[StereoPair], int]:
-    """The pairs of a data set, read when their turn comes, and how many there are.
+def open_dataset(
+    dataset: str, root: Path | None = None, variant: str | None = None, *, rank: int = 0, world_size: int = 1
+) -> tuple[Iterator[StereoPair], int]:
+    """One rank's pairs of a data set, read when their turn comes, and how many there are for all ranks.
 
     Args:
         dataset: "motorcycle", "folder" or a key of BENCHMARKS.
         root: where it lies; not for the motorcycle.
         variant: see `trainers.benchmarks_on_disk.find_benchmark`.
+        rank, world_size: pairs rank, rank + world_size, ... are read, and no others.
     Raises:
         FileNotFoundError, ValueError: it is not there, at once and not when its turn comes; says what was expected where.
     """
     if variant is not None and dataset not in BENCHMARKS:
         raise ValueError(f"--dataset {dataset} has no variants; leave out --variant")
     if dataset == "motorcycle":
-        return iter([motorcycle()]), 1
+        return iter([motorcycle()][rank::world_size]), 1
     if root is None:
         raise ValueError(f"--dataset {dataset} needs --root DIR")
     files = [pair_files(folder) for folder in find_pairs(root)] if dataset == "folder" else find_benchmark(dataset, root, variant)
-    return (pair.read() for pair in files), len(files)
+    return (pair.read() for pair in files[rank::world_size]), len(files)
 
 
 def _report(arguments: argparse.Namespace, options: dict[str, Any], results: list[dict[str, Any]]) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -49,7 +49,7 @@ class TrainConfig:
     iterations: int = 22
     evaluation_iterations: int = 32
     learning_rate: float = 2e-4
-    weight_decay: float = 1e-5
+    weight_decay: float = 1e-5  # RAFT-Stereo's; the paper names none, and its released code leaves torch's default, 1e-2
     clip_norm: float = 1.0
     accumulate: int = 1  # batches per optimizer step
     workers: int = 4
@@ -96,14 +96,16 @@ def train(
     run would have seen. A step whose loss or gradient is not finite, or explodes, is skipped; see `trainers.step_guard`.
 
     Args:
-        loss_function: (initial prediction, sequence of predictions, batch) -> (loss, metrics).
+        loss_function: (initial prediction, sequence of predictions, batch) -> (loss, metrics). Where it is a dataclass, a run is only
+            resumed with one of the same fields.
         output: the run's folder: checkpoints, best, tracker logs, log.jsonl, skipped.jsonl, evaluations.jsonl, evaluation.json. Refused
             where it holds the checkpoints of another run.
         model_config: {"model": name, "options": {...}}, saved with the weights.
         arguments: what the run was started with, saved with its state.
         resume: a run's folder or one of its checkpoints.
         sets: what to judge by at the end, every `config.evaluate_every` steps, and first of all where `config.evaluate_first`. Each time
-            a checkpoint is saved, too, and copied to OUTPUT/best when it is the best so far, see `Validation.is_best`.
+            a checkpoint is saved before, and copied to OUTPUT/best when it is the best so far, see `Validation.is_best`. A run that was
+            stopped in between begins with judging when it is resumed.
         tracker: any of Accelerate's by name, one of your own, or None.
     Raises:
         ValueError, ImportError, OSError: options, a tracker or a checkpoint that cannot be used, or a rank that has other photos.
@@ -135,15 +137,15 @@ def train(
         world_size=accelerator.num_processes,
     )
     output.mkdir(parents=True, exist_ok=True)
-    options = _options_of_a_run(config, model_config)
-    step, training, state = 0, None, {}
+    options = _options_of_a_run(config, model_config, loss_function)
+    step, checkpoint, training, state = 0, None, None, {}
     if resume is not None:
         checkpoint = run_folder.newest(resume)
         training, state = run_folder.load(checkpoint)
         run_folder.require_options(checkpoint, state, options, f"--initial-weights {checkpoint / WEIGHTS_FILE}")
         load_checkpoint(matcher, checkpoint / WEIGHTS_FILE)
     average = None if config.ema is None else WeightAverage(matcher, config.ema)
-    if training is not None:
+    if checkpoint is not None and training is not None:
         if training["weights"]:  # what was saved for use is the average
             matcher.load_state_dict(training["weights"])
         loader.load_state_dict(state["stream"])
@@ -164,10 +166,13 @@ def train(
     if tracker is not None:
         accelerator.init_trackers(output.name or "run", {name: value for name, value in asdict(config).items() if value is not None})
 
-    def save(best: bool = False) -> None:
+    def save() -> Path:
+        folder = run_folder.folder_of(output, step)
+        if checkpoint is not None and checkpoint.resolve() == folder.resolve():
+            return folder  # the run was resumed from it
         if accelerator.is_main_process:
             with weights_of(average, matcher) as weights:
-                saved = run_folder.save(
+                run_folder.save(
                     output,
                     step,
                     matcher,
@@ -183,23 +188,32 @@ def train(
                         "provenance": provenance(stream, arguments),
                     },
                 )
-            if best:
-                run_folder.keep_best(saved, output)
         accelerator.wait_for_everyone()
+        return folder
 
-    def judge() -> dict[str, list[dict[str, Any]]]:
-        """Scores, written down; the checkpoint of this step is saved and, if it is the best so far, kept."""
+    def is_to_be_judged() -> bool:
+        """Whether it is this step's turn, the last one's aside."""
+        every = config.evaluate_every
+        return bool(validation.sets) and (config.evaluate_first if step == 0 else every is not None and step % every == 0)
+
+    def judge(saved: Path) -> dict[str, list[dict[str, Any]]]:
+        """Scores of this step's checkpoint, written down; if it is the best so far, it is kept."""
         with weights_of(average, matcher):
             results = validation.judge(
                 lambda left, right: matcher.predict(left, right, iterations=config.evaluation_iterations),
                 device=accelerator.device,
                 rank=accelerator.process_index,
                 world_size=accelerator.num_processes,
+                out_of_memory=f"{saved} is saved, and trainers/evaluate.py --tile-rows 512 can judge it; --resume {output} goes on "
+                "with --corr-implementation alt (RAFT-Stereo), with smaller images for --evaluate, or without it",
             )
         best = validation.is_best(results, step)
-        save(best)
         if accelerator.is_main_process:
             _write_scores(output, step, results, validation)
+            run_folder.amend(saved, validation=validation.state_dict())
+            if best:
+                run_folder.keep_best(saved, output)
+        accelerator.wait_for_everyone()
         means = {name: mean_scores(scores)["all"] for name, scores in results.items()}
         values = {f"{name}/{metric}": value for name, mean in means.items() for metric, value in mean.items() if value is not None}
         accelerator.log(values, step=step)
@@ -207,16 +221,17 @@ def train(
             accelerator.print(f"step {step}, {name}{', the best so far' if best else ''}:\n{table(scores)}")
         return results
 
+    def mark_here() -> _Mark:
+        return _Mark(step, loader.stats()["seconds"].get("wait", 0.0))
+
     results: dict[str, list[dict[str, Any]]] = {}
     with (
         loader,
         Progress(total=config.steps, initial=step, unit="step", disable=not accelerator.is_main_process, dynamic_ncols=True) as progress,
     ):
-        mark = _Mark(step, loader.stats()["seconds"].get("wait", 0.0))
-        saved_step, judged_step = step, None
-        if validation.sets and config.evaluate_first and step == 0:
-            results = judge()
-            judged_step = step
+        if step < config.steps and is_to_be_judged() and validation.judged_step != step:
+            results = judge(save())
+        mark = mark_here()
         while step < config.steps:
             for batch in loader:
                 with accelerator.accumulate(model):
@@ -252,9 +267,9 @@ def train(
                         "learning_rate": schedule.get_last_lr()[0],
                     }
                     pairs_seen = (step - mark.step) * config.batch_size * config.accumulate * accelerator.num_processes
-                    wait = loader.stats()["seconds"].get("wait", 0.0)
-                    values |= mark.rates(pairs_seen, wait)
-                    mark = _Mark(step, wait)
+                    here = mark_here()
+                    values |= mark.rates(pairs_seen, here)
+                    mark = here
                     progress.set_postfix_str(
                         f"loss {values['loss']:.2f}, EPE {values['epe']:.2f} px, {values['pairs_per_second']:.1f} pairs/s, "
                         f"waiting {values['wait_share']:.0%}"
@@ -265,28 +280,30 @@ def train(
                             output / "log.jsonl", {"step": step, "epoch": place["epoch"], "samples": place["samples"], **values}
                         )
                     accelerator.log(values, step=step)
-                if validation.sets and config.evaluate_every is not None and step % config.evaluate_every == 0:
-                    results = judge()
-                    saved_step = judged_step = step
-                elif step % config.save_every == 0:
-                    save()
-                    saved_step = step
                 if step == config.steps:
                     break
+                if is_to_be_judged():
+                    results = judge(save())
+                elif step % config.save_every == 0:
+                    save()
+                else:
+                    continue
+                mark = mark_here()  # what they took is not the training's
         progress.close()
-        if validation.sets and judged_step != step:
-            results = judge()
-        elif saved_step != step:
-            save()
+        saved = save()
+        if validation.sets:
+            results = judge(saved)
     accelerator.end_training()
     return results
 
 
-def _options_of_a_run(config: TrainConfig, model_config: dict[str, Any]) -> dict[str, Any]:
+def _options_of_a_run(config: TrainConfig, model_config: dict[str, Any], loss_function: LossFunction) -> dict[str, Any]:
     """What cannot change when a run is resumed, in plain JSON."""
     network = {name: value for name, value in model_config.get("options", {}).items() if name not in SAME_NUMBERS}
-    kept = {name: getattr(config, name) for name in ("steps", "learning_rate", "weight_decay", "ema")}
-    return json.loads(json.dumps({"model": model_config.get("model"), **network, **kept}))
+    kept = {name: getattr(config, name) for name in ("steps", "iterations", "learning_rate", "weight_decay", "ema")}
+    fields = asdict(loss_function) if is_dataclass(loss_function) and not isinstance(loss_function, type) else {}
+    loss = {f"the loss's {name}": value for name, value in fields.items()}
+    return json.loads(json.dumps({"model": model_config.get("model"), **network, **kept, **loss}))
 
 
 def _reconstruction(batch: StereoBatch) -> dict[str, Tensor]:
@@ -312,6 +329,6 @@ class _Mark:
         self._time = time.perf_counter()
         self._wait_seconds = wait_seconds
 
-    def rates(self, pairs: int, wait_seconds: float) -> dict[str, float]:
-        elapsed = time.perf_counter() - self._time
-        return {"pairs_per_second": pairs / elapsed, "wait_share": (wait_seconds - self._wait_seconds) / elapsed}
+    def rates(self, pairs: int, until: _Mark) -> dict[str, float]:
+        elapsed = until._time - self._time
+        return {"pairs_per_second": pairs / elapsed, "wait_share": (until._wait_seconds - self._wait_seconds) / elapsed}

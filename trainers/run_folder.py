@@ -92,6 +92,16 @@ def write(output: Path, step: int, weights: Callable[[Path], None], training: di
     return folder
 
 
+def amend(checkpoint: Path, **state: Any) -> None:
+    """Writes what was found out about a checkpoint into its state.json, in the place of what it says there; as a whole or not at all."""
+    file = checkpoint / "state.json"
+    unfinished = checkpoint / f".state.json{HIDDEN}"
+    unfinished.write_text(json.dumps({**_state(checkpoint), **state}, indent=2) + "\n")
+    _flush(unfinished)
+    os.replace(unfinished, file)
+    _flush(checkpoint)
+
+
 def folder_of(output: Path, step: int) -> Path:
     """The folder of the checkpoint of `step`."""
     return output / "checkpoints" / f"step-{step:08d}"

@@ -8,20 +8,20 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from trainers.pairs_on_disk import StereoPair
-from zsdata.metrics import bad_pixel_rate, d1, disparity_edges, end_point_error
+from zsdata.metrics import D1_PIXELS, D1_SHARE, disparity_edges
 
-METRICS: dict[str, Callable[[Tensor, Tensor, Tensor], float]] = {
-    "epe": end_point_error,
-    "bad_0.5": lambda *maps: bad_pixel_rate(*maps, threshold_px=0.5),
-    "bad_1": lambda *maps: bad_pixel_rate(*maps, threshold_px=1),
-    "bad_2": lambda *maps: bad_pixel_rate(*maps, threshold_px=2),
-    "bad_3": lambda *maps: bad_pixel_rate(*maps, threshold_px=3),
-    "d1": d1,
+# (absolute errors, true disparities) -> what the score is the mean of: those of `zsdata.metrics`, but of errors that are computed once.
+METRICS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "epe": lambda errors, truth: errors,
+    "bad_0.5": lambda errors, truth: errors > 0.5,
+    "bad_1": lambda errors, truth: errors > 1,
+    "bad_2": lambda errors, truth: errors > 2,
+    "bad_3": lambda errors, truth: errors > 3,
+    "d1": lambda errors, truth: (errors > D1_PIXELS) & (errors > D1_SHARE * truth.abs()),
 }
 HEADINGS = {"epe": "EPE px", "bad_0.5": "bad-0.5 %", "bad_1": "bad-1 %", "bad_2": "bad-2 %", "bad_3": "bad-3 %", "d1": "D1 %"}
 EDGES = "_edges"
@@ -43,14 +43,16 @@ def score(prediction: Tensor, pair: StereoPair, below_px: Sequence[float] = ()) 
     Raises:
         ValueError: a prediction that is not finite where it counts.
     """
-    edges = disparity_edges(torch.from_numpy(pair.disparity), torch.from_numpy(pair.valid)).numpy()
-    parts = {"": pair.valid, EDGES: pair.valid & edges}
-    parts |= {f"_below_{limit:g}": pair.valid & (pair.disparity < limit) for limit in below_px}
+    disparity, valid = torch.from_numpy(pair.disparity), torch.from_numpy(pair.valid)
+    edges = disparity_edges(disparity, valid)[valid]
+    truth = disparity[valid]
+    seen = None if pair.nonoccluded is None else torch.from_numpy(pair.nonoccluded[pair.valid])
+    values = _values(prediction[valid], truth)
+    parts = {"": torch.ones_like(edges), EDGES: edges} | {f"_below_{limit:g}": truth < limit for limit in below_px}
     scores: dict[str, dict[str, Any] | None] = {}
     for suffix, counted in parts.items():
-        scores[f"all{suffix}"] = _values(prediction, pair.disparity, counted)
-        seen = pair.nonoccluded
-        scores[f"noc{suffix}"] = None if seen is None else _values(prediction, pair.disparity, counted & seen)
+        scores[f"all{suffix}"] = _means(values, counted)
+        scores[f"noc{suffix}"] = None if seen is None else _means(values, counted & seen)
     return scores
 
 
@@ -117,11 +119,25 @@ def write_csv(path: Path, results: Sequence[dict[str, Any]]) -> None:
                     writer.writerow([name, group, region, scores.get("pixels"), *[scores[key] for key in METRICS]])
 
 
-def _values(prediction: Tensor, disparity: np.ndarray, mask: np.ndarray) -> dict[str, Any]:
-    counted = torch.from_numpy(mask)
-    maps = prediction[counted], torch.from_numpy(disparity)[counted], counted[counted]
-    values = {name: metric(*maps) for name, metric in METRICS.items()}
-    return {"pixels": int(mask.sum())} | {name: None if math.isnan(value) else value for name, value in values.items()}
+def _values(estimate: Tensor, truth: Tensor) -> dict[str, Tensor]:
+    """What each of the METRICS is the mean of, for every pixel with ground truth."""
+    for name, disparity in (("prediction", estimate), ("disparity", truth)):
+        broken = int((~disparity.isfinite()).sum())
+        if broken:
+            raise ValueError(f"{name} is not finite at {broken} of {disparity.numel()} valid pixels")
+    truth = truth.double()
+    errors = (estimate.double() - truth).abs()
+    return {name: metric(errors, truth) for name, metric in METRICS.items()}
+
+
+def _means(values: dict[str, Tensor], counted: Tensor) -> dict[str, Any]:
+    pixels = int(counted.sum())
+    if not pixels:
+        return {"pixels": 0, **dict.fromkeys(METRICS)}
+    return {"pixels": pixels} | {
+        name: int((value & counted).sum()) / pixels if value.dtype == torch.bool else value[counted].mean().item()
+        for name, value in values.items()
+    }
 
 
 def _mean(values: list[float], weights: list[int]) -> float | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import torch
 from accelerate.utils import gather_object
 
 from trainers.benchmarks_on_disk import BENCHMARKS
-from trainers.evaluate import evaluate, open_dataset
+from trainers.evaluate import OUT_OF_MEMORY, evaluate, open_dataset
 from trainers.pairs_on_disk import StereoPair
 from trainers.scores import METRICS, mean_scores
 from trainers.strips import Predict
@@ -51,9 +50,9 @@ class EvaluationSet:
         parsed.pairs()
         return parsed
 
-    def pairs(self) -> tuple[Iterator[StereoPair], int]:
-        """The pairs, read one by one, and how many there are."""
-        return open_dataset(self.dataset, self.root, self.variant)
+    def pairs(self, *, rank: int = 0, world_size: int = 1) -> tuple[Iterator[StereoPair], int]:
+        """The pairs of one rank, read one by one, and how many there are for all of them."""
+        return open_dataset(self.dataset, self.root, self.variant, rank=rank, world_size=world_size)
 
 
 class Validation:
@@ -67,20 +66,24 @@ class Validation:
             raise ValueError(f"two evaluation sets have one name: {', '.join(names)}; put the pairs of both below one folder")
         self.sets = list(sets)
         self.best_by = best_by
-        self.best: dict[str, Any] | None = None  # {"step", "value"}
+        self.best: dict[str, Any] | None = None  # {"step", "value", "by"}
+        self.judged_step: int | None = None  # the last one
 
-    def judge(self, predict: Predict, *, device: torch.device, rank: int, world_size: int) -> dict[str, list[dict[str, Any]]]:
+    def judge(
+        self, predict: Predict, *, device: torch.device, rank: int, world_size: int, out_of_memory: str = OUT_OF_MEMORY
+    ) -> dict[str, list[dict[str, Any]]]:
         """The scores of every pair of every set, as `trainers.evaluate.evaluate` returns them, the same on all ranks.
 
-        Rank 0 shows how far it has come.
+        Each rank reads only the pairs that it judges. Rank 0 shows how far it has come.
         """
         results = {}
         for one in self.sets:
-            pairs, total = one.pairs()
+            mine, total = one.pairs(rank=rank, world_size=world_size)
             below = BENCHMARKS[one.dataset].below_px if one.dataset in BENCHMARKS else ()
             places = range(rank, total, world_size)
-            mine = islice(pairs, rank, None, world_size)
-            scores = evaluate(predict, mine, device=device, total=len(places), below_px=below, progress=rank == 0)
+            scores = evaluate(
+                predict, mine, device=device, total=len(places), below_px=below, progress=rank == 0, out_of_memory=out_of_memory
+            )
             together = gather_object(list(zip(places, scores, strict=True)))
             results[one.name] = [score for _, score in sorted(together, key=lambda entry: entry[0])]
         return results
@@ -90,6 +93,7 @@ class Validation:
 
         What counts is `best_by` over all pixels with ground truth, averaged over the pairs of a set and then over the sets; less is better.
         """
+        self.judged_step = step
         value = self.value(results)
         if value is None or (self.best is not None and value >= self.best["value"]):
             return False
@@ -103,9 +107,10 @@ class Validation:
         return math.fsum(known) / len(known) if known else None
 
     def state_dict(self) -> dict[str, Any]:
-        return {"best": self.best}
+        return {"best": self.best, "judged_step": self.judged_step}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Goes on with the best of an earlier run, unless that was told by another measure."""
+        self.judged_step = state["judged_step"]
         best = state["best"]
         self.best = best if best is not None and best["by"] == self.best_by else None

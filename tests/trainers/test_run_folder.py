@@ -105,6 +105,20 @@ def test_killed_at_any_touch_of_a_file_there_is_a_whole_checkpoint_and_the_next_
     assert touch > 10 and len(outcomes) <= 3
 
 
+def test_killed_at_any_touch_of_a_file_an_amendment_is_there_or_is_not(before, tmp_path):
+    for touch in range(100):
+        output = tmp_path / str(touch)
+        shutil.copytree(before, output)
+        checkpoint = run_folder.folder_of(output, LAST)
+        killed = killed_at(touch, lambda _: run_folder.amend(checkpoint, score=1), output)  # noqa: B023
+        assert value_of(checkpoint) == LAST
+        found = run_folder.load(checkpoint)[1]
+        assert {**found, "score": 1} == {"step": LAST, "value": float(LAST), "score": 1}
+        if not killed:
+            break
+    assert touch > 3 and found["score"] == 1 and not list(checkpoint.glob(".*"))
+
+
 def test_a_new_run_is_refused_in_the_folder_of_another_and_told_the_way_out(tmp_path):
     run_folder.check_output(tmp_path / "new", None)
     for step in (100, 200):

@@ -6,10 +6,12 @@ import json
 import numpy as np
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.oracles_scores import NAMES, plain_edges, plain_scores
 from trainers.pairs_on_disk import StereoPair
 from trainers.scores import METRICS, all_means, mean_scores, score, table, write_csv
+from zsdata.metrics import bad_pixel_rate, d1, disparity_edges, end_point_error
 
 
 def broken_pair(seed: int, name: str = "broken", *, group: str = "", seen: float | None = 0.6, known: float = 0.7):
@@ -38,6 +40,37 @@ def test_every_region_is_scored_as_counted_pixel_by_pixel(seed):
     for part, mask in counted.items():
         assert scores[f"all{part}"] == pytest.approx(plain_scores(prediction, stored, mask), rel=1e-9)
         assert scores[f"noc{part}"] == pytest.approx(plain_scores(prediction, stored, mask & pair.nonoccluded), rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_scores_are_those_of_the_metrics_to_the_last_bit(seed):
+    pair, _, prediction = broken_pair(seed)
+    maps = torch.from_numpy(prediction), torch.from_numpy(pair.disparity)
+    valid, seen = torch.from_numpy(pair.valid), torch.from_numpy(pair.nonoccluded)
+    scores = score(maps[0], pair, below_px=(54.6,))
+    regions = {"": valid, "_edges": valid & disparity_edges(maps[1], valid), "_below_54.6": valid & (maps[1] < 54.6)}
+    for name, region in regions.items():
+        for kind, counted in (("all", region), ("noc", region & seen)):
+            bad = {f"bad_{limit:g}": bad_pixel_rate(*maps, counted, threshold_px=limit) for limit in (0.5, 1, 2, 3)}
+            expected = {"epe": end_point_error(*maps, counted), **bad, "d1": d1(*maps, counted)}
+            assert scores[kind + name] == {"pixels": int(counted.sum()), **expected}
+
+
+class CountsConversions(TorchDispatchMode):
+    """To float64, of which a pass over the errors needs one of the prediction and one of the truth."""
+
+    count = 0
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        self.count += function is torch.ops.aten._to_copy.default and (kwargs or {}).get("dtype") is torch.float64
+        return function(*args, **(kwargs or {}))
+
+
+def test_the_errors_are_computed_once_for_all_scores_of_all_regions():
+    pair, _, prediction = broken_pair(0)
+    with CountsConversions() as conversions:
+        score(torch.from_numpy(prediction), pair, below_px=(20, 40))
+    assert conversions.count == 2
 
 
 def test_a_pair_without_a_mask_or_a_pixel_has_no_scores():

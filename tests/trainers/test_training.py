@@ -7,6 +7,7 @@ import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -25,7 +26,7 @@ from trainers.models import load_matcher, load_trained
 from trainers.models.raft_stereo import RAFTStereo
 from trainers.step_guard import MOST_SKIPPED_IN_A_ROW, TrainingDiverged
 from trainers.training_loss import TrainingLoss
-from trainers.validation import EvaluationSet
+from trainers.validation import EvaluationSet, Validation
 from zsdata import AugmentConfig, StereoBatch, ZeroStereoStream
 from zsdata.synthesis.backward_warp import backward_warp
 
@@ -208,6 +209,83 @@ def test_the_average_the_best_and_the_skipped_steps_come_back_on_resume(tar, tmp
     assert [one["all"] for one in scores] == [one["all"] for one in expected_scores]
 
 
+def power_cut_at_call(number, function):
+    """As `function`, but the power goes out at its call `number`, before it does anything."""
+    calls = iter(range(1, number))
+
+    def failing(*arguments, **options):
+        if next(calls, None) is None:
+            raise RuntimeError("power cut")
+        return function(*arguments, **options)
+
+    return failing
+
+
+STOPS = [
+    (Validation, "judge", 1),
+    (Validation, "judge", 3),
+    (run_folder, "amend", 2),
+    (run_folder, "amend", 3),
+    (run_folder, "keep_best", 1),
+]
+
+
+@pytest.mark.parametrize(("where", "name", "call"), STOPS, ids=[f"{name} {call}" for _, name, call in STOPS])
+def test_a_step_is_saved_before_it_is_judged_and_a_run_that_stops_there_judges_it_when_resumed(
+    tar, tmp_path, pairs_folder, monkeypatch, where, name, call
+):
+    settings = config(steps=5, ema=0.5, evaluate_every=2, evaluation_iterations=1, best_by="epe")
+    sets, unbroken, broken = [EvaluationSet.parse(str(pairs_folder))], tmp_path / "unbroken", tmp_path / "broken"
+    run_training(tar, unbroken, settings, sets=sets)
+    steps = [2, 4, 5]
+    assert [line["step"] for line in read_lines(unbroken / "evaluations.jsonl")] == steps
+    AcceleratorState._reset_state(reset_partial_state=True)
+    with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="power cut"):
+        patch.setattr(where, name, power_cut_at_call(call, getattr(where, name)))
+        run_training(tar, broken, settings, sets=sets)
+    assert run_folder.newest(broken) == run_folder.folder_of(broken, steps[call - 1])
+    AcceleratorState._reset_state(reset_partial_state=True)
+    run_training(tar, broken, settings, sets=sets, resume=broken)
+    for step in steps:
+        (_, expected), (_, found) = (run_folder.load(run_folder.folder_of(output, step)) for output in (unbroken, broken))
+        assert found["validation"] == expected["validation"] and found["validation"]["judged_step"] == step
+    best = [json.loads((output / "best" / "state.json").read_text()) for output in (unbroken, broken)]
+    assert best[0]["step"] == best[1]["step"] == best[0]["validation"]["best"]["step"] == best[1]["validation"]["best"]["step"]
+    judged = [{line["step"]: line["epe"] for line in read_lines(output / "evaluations.jsonl")} for output in (unbroken, broken)]
+    assert judged[0] == judged[1]
+
+
+def test_an_evaluation_that_does_not_fit_is_told_where_the_checkpoint_is_and_how_to_go_on(tar, tmp_path, pairs_folder, monkeypatch):
+    def full(*arguments, **options):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(RAFTStereo, "predict", full)
+    with pytest.raises(MemoryError, match=r"far, 96 x 64 px, .*step-00000002 is saved, .*--tile-rows .*--resume .*run goes on") as error:
+        run_training(tar, tmp_path / "run", config(steps=2), sets=[EvaluationSet.parse(str(pairs_folder))])
+    assert "--mixed-precision" not in str(error.value), "which an evaluation does not heed"
+    assert run_folder.newest(tmp_path / "run").name == "step-00000002"
+
+
+def test_the_rates_in_the_log_leave_out_what_evaluations_and_checkpoints_take(tar, tmp_path, pairs_folder, monkeypatch):
+    clock = SimpleNamespace(seconds=0.0)
+
+    def takes(seconds, function):
+        def taking(*arguments, **options):
+            clock.seconds += seconds
+            return function(*arguments, **options)
+
+        return taking
+
+    monkeypatch.setattr(loop, "time", SimpleNamespace(perf_counter=lambda: clock.seconds))
+    monkeypatch.setattr(loop, "LOG_EVERY_STEPS", 2)
+    monkeypatch.setattr(Validation, "judge", takes(1000, Validation.judge))
+    monkeypatch.setattr(run_folder, "save", takes(100, run_folder.save))
+    settings = config(steps=8, save_every=2, evaluate_every=3, evaluate_first=True, evaluation_iterations=1)
+    run_training(tar, tmp_path / "run", settings, loss=takes(0.5, PAPERS_LOSS), sets=[EvaluationSet.parse(str(pairs_folder))])
+    rates = [line["pairs_per_second"] for line in read_lines(tmp_path / "run" / "log.jsonl")]
+    assert rates == [settings.batch_size / 0.5] * 4
+
+
 def test_the_best_of_another_folder_or_of_the_checkpoint_itself_is_restored(tar, tmp_path, pairs_folder):
     settings = config(steps=2, evaluation_iterations=1)
     run_training(tar, tmp_path / "run", settings, sets=[EvaluationSet.parse(str(pairs_folder))])
@@ -225,6 +303,8 @@ def test_the_best_of_another_folder_or_of_the_checkpoint_itself_is_restored(tar,
         (["--learning-rate", "0.1"], "with learning_rate 0.0002, this one has 0.1"),
         (["--ema", "0.9"], "with ema None, this one has 0.9"),
         (["--corr-radius", "3"], "with corr_radius 4, this one has 3"),
+        (["--iterations", "3"], "with iterations 2, this one has 3"),
+        (["--loss", "l1"], "with the loss's name zero, this one has l1"),
         (["--corr-implementation", "alt"], None),
     ],
 )
@@ -236,6 +316,13 @@ def test_what_a_run_cannot_change_on_its_way_is_refused_on_resume(tar, tmp_path,
     else:
         with pytest.raises(SystemExit, match=message):
             run_command(monkeypatch, *changed)
+
+
+def test_a_run_of_other_supervised_disparities_is_not_resumed(tar, tmp_path):
+    run_training(tar, tmp_path / "run", config(steps=2))
+    AcceleratorState._reset_state(reset_partial_state=True)
+    with pytest.raises(ValueError, match="with the loss's max_disparity 700, this one has 192"):
+        run_training(tar, tmp_path / "run", config(steps=2), resume=tmp_path / "run", loss=TrainingLoss(max_disparity=192))
 
 
 def test_a_run_of_another_matcher_is_not_resumed(tar, tmp_path, monkeypatch):
@@ -301,7 +388,7 @@ def test_too_many_skipped_steps_in_a_row_are_an_error_and_the_run_can_be_resumed
     with pytest.raises(TrainingDiverged, match=rf"the loss is inf at step {MOST_SKIPPED_IN_A_ROW - 1}.*skipped.jsonl.*replay"):
         run_training(tar, tmp_path / "run", settings, loss=broken)
     AcceleratorState._reset_state(reset_partial_state=True)
-    matcher = run_training(tar, tmp_path / "run", settings, resume=tmp_path / "run")
+    matcher = run_training(tar, tmp_path / "run", settings, resume=tmp_path / "run", loss=recorder([]))
     assert all(torch.isfinite(weight).all() for weight in matcher.state_dict().values())
 
 

@@ -3,7 +3,9 @@ from __future__ import annotations
 import pytest
 import torch
 
+from tests.scenes import shifted_pairs
 from tests.trainers.benchmark_folders import write_benchmark
+from trainers.pairs_on_disk import PairFiles
 from trainers.validation import EvaluationSet, Validation
 
 
@@ -78,6 +80,24 @@ def test_ranks_share_the_pairs_and_know_all_scores_and_the_first_shows_how_far_i
         scores = validation.judge(predict, device=torch.device("cpu"), rank=rank, world_size=2)["kitti2015"]
         assert ("evaluate: 100%" in capsys.readouterr().err) == (rank == 0)
     assert len(seen) == 2 and [score["name"] for score in scores] == ["000000_10", "000001_10"]
+
+
+def test_a_rank_reads_no_pair_but_those_that_it_judges(tmp_path, monkeypatch):
+    for i in range(4):
+        for folder in shifted_pairs(tmp_path / str(i)).iterdir():
+            folder.rename(tmp_path / f"{i}-{folder.name}")
+        (tmp_path / str(i)).rmdir()
+    read = PairFiles.read
+    names: list[str] = []
+    monkeypatch.setattr(PairFiles, "read", lambda files: names.append(files.name) or read(files))
+    monkeypatch.setattr("trainers.validation.gather_object", lambda mine: mine)
+    one = EvaluationSet.parse(str(tmp_path))
+    for rank in range(4):
+        names.clear()
+        scores = Validation([one]).judge(lambda left, _: left[:, :1], device=torch.device("cpu"), rank=rank, world_size=4)[one.name]
+        expected = [f"{i}-{name}" for i in range(4) for name in ("far", "near")][rank::4]
+        assert names == [score["name"] for score in scores] == expected and len(names) == 2
+    assert [len(list(EvaluationSet.parse("motorcycle").pairs(rank=rank, world_size=2)[0])) for rank in (0, 1)] == [1, 0]
 
 
 def test_two_sets_of_one_name_and_an_unknown_measure_are_refused(tmp_path):
