@@ -1,5 +1,6 @@
 """The `zsdata` command: what it prints, what it writes, how it ends."""
 
+import errno
 import gzip
 import os
 import shlex
@@ -17,6 +18,7 @@ import zsdata
 from zsdata import cli
 from zsdata.example_photos import EXAMPLE_PHOTOS
 from zsdata.exported import load_exported, read_exported
+from zsdata.faults import WorkerLost
 from zsdata.source.archive import read_shard
 
 from .scenes import grey_fill, jpeg, layered_depth, photo, photo_tar, write_tar
@@ -117,12 +119,21 @@ def test_pack_lists_what_it_skipped_but_not_without_end(run, folder, tmp_path):
     assert lines[start + 20].startswith("  bad 19.jpg") and lines[start + 21] == "  ... and 3 more"
 
 
+def test_what_pack_packs_verify_finds_good(run, folder, tmp_path):
+    (folder / "icon.jpg").write_bytes(jpeg(photo(0, 16, 16)))
+    status, out, _ = run("pack", folder, tmp_path / "shards")
+    assert status == 0 and "packed 3 photos" in out and "  icon.jpg: too small: a side shorter than 32 px: 16x16" in out
+    assert run("verify", tmp_path / "shards")[0] == 0
+
+
 def test_pack_refuses_in_words(run, folder, tmp_path):
     status, out, error = run("pack", tmp_path / "missing", tmp_path / "shards")
     assert (status, out) == (2, "") and "missing is not a folder" in in_words(error)
     (tmp_path / "empty").mkdir()
     status, _, error = run("pack", tmp_path / "empty", tmp_path / "shards")
     assert status == 2 and "no photo to pack" in in_words(error)
+    status, _, error = run("pack", folder, folder)
+    assert status == 2 and "is the folder of photos itself" in in_words(error)
 
 
 def test_pack_replaces_shards_only_when_told_to(run, folder, tmp_path):
@@ -184,6 +195,10 @@ def test_verify_lists_every_problem(run, tmp_path):
 def test_verify_of_nothing_is_status_2(run, tmp_path):
     status, out, error = run("verify", tmp_path / "{000..009}.tar")
     assert (status, out) == (2, "") and "000.tar" in in_words(error)
+    status, out, _ = run("verify", "memory://cli/none.tar")
+    assert status == 2 and "memory://cli/none.tar at byte 0: cannot be read" in out
+    shard = photo_tar(tmp_path / "a.tar", count=1)
+    assert run("verify", "memory://cli/none.tar", shard)[0] == 1
 
 
 def test_index_lists_once_and_says_what_is_wrong(run, tmp_path):
@@ -371,6 +386,42 @@ def test_a_failure_inside_keeps_its_traceback(tmp_path, monkeypatch):
     with pytest.raises(RuntimeError, match="sample 0 of epoch 0") as raised:
         cli.main(["preview", "--sources", shard, "--output", str(tmp_path / "p.png")])
     assert isinstance(raised.value.__cause__, TypeError)
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (WorkerLost("worker 0 of 1 was killed"), "worker 0 of 1 was killed"),
+        (MemoryError(), "memory ran out; fewer workers"),
+        (MemoryError("no memory to decode a photo"), "no memory to decode a photo"),
+    ],
+)
+def test_a_lost_worker_and_memory_that_ran_out_are_told_in_words(run, tmp_path, monkeypatch, error, told):
+    def fail(*given, **more):
+        raise error
+
+    monkeypatch.setattr(cli, "verify", fail)
+    status, out, said = run("verify", tmp_path)
+    assert (status, out) == (2, "") and in_words(said).startswith(f"zsdata: {told}")
+
+
+@pytest.mark.parametrize(
+    ("cause", "told"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), "failed: [Errno 28] No space left on device"),
+        (ValueError("no such depth"), "failed: no such depth"),
+        (MemoryError(), "failed: memory ran out; fewer workers"),
+    ],
+)
+def test_a_sample_that_failed_for_what_the_user_can_mend_is_told_in_words(run, tmp_path, monkeypatch, cause, told):
+    def depth(images):
+        raise cause
+
+    monkeypatch.setattr(cli, "load_depth", lambda name: depth)
+    monkeypatch.setattr(cli, "load_inpainter", lambda name: grey_fill)
+    shard = photo_tar(tmp_path / "a.tar", count=1)
+    status, out, error = run("preview", "--sources", shard, "--output", tmp_path / "p.png")
+    assert (status, out) == (2, "") and in_words(error).startswith("zsdata: sample 0 of epoch 0 ") and told in error
 
 
 def test_python_m_zsdata_is_the_command(folder, tmp_path):

@@ -53,6 +53,6 @@ def test_the_command_prints_a_row_per_source(sources, tmp_path, capsys):
 def test_sources_on_a_command_line():
     assert parse_sources(["a.tar", "s3://b/c=d.tar"]) == ["a.tar", "s3://b/c=d.tar"]
     assert parse_sources(["in=a.tar@0.7", "out=b.tar"]) == {"in": ImageSource("a.tar", 0.7), "out": ImageSource("b.tar")}
-    for wrong in (["in=a.tar", "b.tar"], ["in=a.tar@much"], ["=a.tar"], ["in=a.tar", "in=b.tar"]):
-        with pytest.raises(ValueError, match=r"got|no number"):
+    for wrong in (["in=a.tar", "b.tar"], ["=a.tar"], ["in=a.tar", "in=b.tar"]):
+        with pytest.raises(ValueError, match="got"):
             parse_sources(wrong)

@@ -23,7 +23,7 @@ from zsdata.augment import AugmentConfig
 from zsdata.bench import REST, BenchReport, advice, bench, fill_depth_cache, leave_holes, samples_needed
 from zsdata.example_photos import EXAMPLE_PHOTOS, pack_example_photos
 from zsdata.export import export_pairs
-from zsdata.faults import BadShard, NoUsablePhoto, TooManyFaults
+from zsdata.faults import BadShard, NoUsablePhoto, TooManyFaults, WorkerLost
 from zsdata.preview import contact_sheet
 from zsdata.progress import Progress
 from zsdata.sample import StereoBatch
@@ -42,6 +42,7 @@ from zsdata.synthesis.inpaint import Inpainter, load_inpainter
 from zsdata.worker import SHORTEST_SIDE_PX
 
 OK, FOUND_PROBLEMS, USER_ERROR, INTERRUPTED, PIPE_CLOSED = 0, 1, 2, 130, 141  # the last two as a shell counts signals
+TOLD_IN_WORDS = (OSError, ValueError, ImportError, BadShard, NoUsablePhoto, TooManyFaults, WorkerLost, MemoryError)
 SKIPPED_SHOWN = 20
 
 _URLS = (
@@ -51,7 +52,7 @@ _URLS = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command; returns its exit status: 0 done, 1 verify found problems, 2 an error that the user can mend, 130 interrupted."""
+    """Runs one command; returns its exit status: 0 done, 1 problems found, 2 an error that the user can mend, 130 interrupted."""
     options = _parser().parse_args(arguments)
     try:
         with warnings.catch_warnings():
@@ -64,11 +65,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # whoever read the output, such as `head`, has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return PIPE_CLOSED
-    except OSError as error:
+    except TOLD_IN_WORDS as error:
+        return _fail(_in_words(error), USER_ERROR)
+    except RuntimeError as error:  # what the error was about was added to it, see `zsdata.worker.naming`
+        cause = error.__cause__
+        if not isinstance(cause, TOLD_IN_WORDS):
+            raise
+        return _fail(str(error) if str(cause) else f"{error}{_in_words(cause)}", USER_ERROR)
+
+
+def _in_words(error: Exception) -> str:
+    if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename and error.strerror else ""
-        return _fail(where + (error.strerror or str(error)), USER_ERROR)
-    except (ValueError, ImportError, BadShard, NoUsablePhoto, TooManyFaults) as error:
-        return _fail(str(error), USER_ERROR)
+        return where + (error.strerror or str(error))
+    if isinstance(error, MemoryError):  # Python's own says nothing
+        return str(error) or "memory ran out; fewer workers, smaller pairs or smaller photos need less"
+    return str(error)
 
 
 def _fail(message: str, status: int) -> int:
@@ -308,7 +320,9 @@ def _positive(text: str) -> int:
 
 
 def _pack(options: argparse.Namespace) -> int:
-    return _pack_and_tell(partial(pack, options.folder, photos_per_shard=options.photos_per_shard), options)
+    return _pack_and_tell(
+        partial(pack, options.folder, photos_per_shard=options.photos_per_shard, shortest_side_px=SHORTEST_SIDE_PX), options
+    )
 
 
 def _example(options: argparse.Namespace) -> int:
@@ -346,7 +360,7 @@ def _verify(options: argparse.Namespace) -> int:
     reasons = Counter(problem.reason.split(":")[0] for problem in report.problems)
     by_reason = ", ".join(f"{reason}: {count:,}" for reason, count in reasons.most_common())
     print(f"{_several(len(report.problems), 'problem')} ({_printable(by_reason)}); {good}")
-    return FOUND_PROBLEMS
+    return FOUND_PROBLEMS if report.opened else USER_ERROR
 
 
 def _index(options: argparse.Namespace) -> int:

@@ -15,6 +15,7 @@ from typing import Any
 
 from zsdata.plan import EpochPlan, quotas_for
 from zsdata.source.manifest import Manifest, build_manifest
+from zsdata.source.urls import shown_url
 from zsdata.synthesis.depth.options import STORED
 
 logger = logging.getLogger("zsdata")
@@ -36,25 +37,40 @@ class ImageSource:
 def parse_sources(specs: Sequence[str]) -> list[str] | dict[str, ImageSource]:
     """Sources as a command line names them: urls, or NAME=URL and NAME=URL@WEIGHT ("indoor=in.tar@0.7").
 
+    A name has no "/", so "./year=2020/a.tar" has none, and neither has a path that exists. What follows the last "@" is a weight if it is
+    a number, and part of the url otherwise.
+
     Raises:
-        ValueError: a name without a url, a weight that is no number, or names for some only.
+        ValueError: a name without a url, a name given twice, or names for some only.
     """
-    named = ["=" in spec.split("://")[0] for spec in specs]
-    if not any(named):
+    named = [_split_name(spec) for spec in specs]
+    if all(name is None for name, _ in named):
         return list(specs)
     sources: dict[str, ImageSource] = {}
-    for spec in specs:
-        name, _, rest = spec.partition("=")
-        urls, weight = rest.rsplit("@", 1) if "@" in rest else (rest, "")
+    for name, rest in named:
+        urls, weight = _split_weight(rest)
         if not name or not urls or name in sources:
+            shown = shown_url(rest) if name is None else f"{name}={shown_url(rest)}"
             raise ValueError(
-                f"a named source is NAME=URL or NAME=URL@WEIGHT, each name once, and all sources have one or none; got {spec!r}"
+                f"a named source is NAME=URL or NAME=URL@WEIGHT, each name once, and all sources have one or none; got {shown!r}"
             )
-        try:
-            sources[name] = ImageSource(urls, weight=float(weight) if weight else None)
-        except ValueError:
-            raise ValueError(f"the weight in {spec!r} is no number") from None
+        sources[name] = ImageSource(urls, weight=weight)
     return sources
+
+
+def _split_name(spec: str) -> tuple[str | None, str]:
+    """NAME and the rest of NAME=URL; None and all of a url without a name."""
+    name, equals, rest = spec.partition("=")
+    return (name, rest) if equals and "/" not in name and not os.path.exists(spec) else (None, spec)
+
+
+def _split_weight(text: str) -> tuple[str, float | None]:
+    """URL and WEIGHT of URL@WEIGHT; all of it and None where no number is at its end."""
+    urls, at, weight = text.rpartition("@")
+    try:
+        return (urls, float(weight)) if at else (text, None)
+    except ValueError:  # the "@" is the url's
+        return text, None
 
 
 @dataclass(frozen=True)

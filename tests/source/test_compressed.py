@@ -8,10 +8,12 @@ import fsspec
 import pytest
 
 from zsdata.faults import BadShard
-from zsdata.source import compressed
+from zsdata.source import compressed, http_ranges, ranges
 from zsdata.source.archive import read_shard
 from zsdata.source.compressed import decompress
+from zsdata.source.retry import MissingShard, UnreachableShard
 
+from .http_server import ScriptedServer, answer, cut, whole
 from .test_tar import write_tar
 
 PLAIN = write_tar([(f"{number}.jpg", os.urandom(3000)) for number in range(5)])
@@ -110,3 +112,27 @@ def test_remote_files_are_read_too(tmp_path):
     fsspec.filesystem("memory").pipe("/compressed/a.tar.gz", gzip.compress(PLAIN))
     (path,) = decompress("memory://compressed/a.tar.gz", tmp_path / "out", progress=False)
     assert len(list(read_shard(path))) == 5
+
+
+def test_files_behind_http_are_read_without_other_packages(tmp_path, monkeypatch):
+    for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(ranges, "FIRST_BYTES", 1 << 10)
+    monkeypatch.setattr(ranges, "WINDOW_BYTES", 1 << 12)
+    monkeypatch.setattr(compressed, "CHUNK_BYTES", 1 << 11)
+    with ScriptedServer() as server:
+        url = server.put("a.tar.gz", gzip.compress(PLAIN)) + "?token=secret"
+        server.script = [answer(503), cut(100)]
+        (path,) = decompress(url, tmp_path / "out")
+        assert len(list(read_shard(path))) == 5 and len(server.requests) > 5
+        with pytest.raises(MissingShard, match=r"none\.tar\.gz: .*404"):
+            decompress(url.replace("a.tar", "none.tar"), tmp_path / "out")
+        server.always = whole
+        with pytest.raises(UnreachableShard, match="the server ignores ranges; download the shard"):
+            decompress(url, tmp_path / "out", overwrite=True)
+        server.always = None
+        plain = server.put("b.tar", PLAIN) + "?token=secret"
+        with pytest.raises(ValueError, match=r"/b\.tar is not compressed"):
+            decompress(plain, tmp_path / "out")
+        http_ranges.close_connections()
+    assert files(tmp_path / "out") == ["a.tar"]

@@ -182,7 +182,7 @@ def test_a_server_that_is_not_there_is_a_clear_error(server, impatient):
 def test_the_pauses_grow_differ_and_follow_the_server(server, url, monkeypatch):
     pauses, now = [], [0.0]
     clock = SimpleNamespace(monotonic=lambda: now[0], time=lambda: 1_000_000_000.0)
-    clock.sleep = lambda seconds: (pauses.append(seconds), now.__setitem__(0, now[0] + seconds))
+    monkeypatch.setattr(retry, "pause", lambda seconds: (pauses.append(seconds), now.__setitem__(0, now[0] + seconds)))
     monkeypatch.setattr(retry, "time", clock)
     monkeypatch.setattr(retry, "FIRST_PAUSE_SECONDS", 0.1)
     monkeypatch.setattr(retry, "LONGEST_PAUSE_SECONDS", 5.0)

@@ -14,7 +14,8 @@ from zsdata.source.archive import read_shard
 from zsdata.source.index import write_index
 from zsdata.source.manifest import build_manifest
 from zsdata.source.pack import pack
-from zsdata.source.photo import PhotoFile, decode_rgb
+from zsdata.source.photo import decode_rgb, usable_photo
+from zsdata.source.verify import verify
 
 from .images import encode, picture
 
@@ -111,6 +112,20 @@ def test_what_cannot_be_used_is_left_out_and_listed(photos, tmp_path):
     ]
 
 
+def test_photos_with_a_side_too_short_are_left_out_where_a_limit_is_given(photos, tmp_path):
+    files = fill(photos, "good.jpg")  # 20 x 30
+    (photos / "icon.png").write_bytes(encode(picture(16, 30), "PNG"))
+    np.save(photos / "icon.depth.npy", np.ones((16, 30), np.float32))
+    assert pack(photos, tmp_path / "all").photos == 2
+    report = pack(photos, tmp_path / "shards", shortest_side_px=20)
+    assert contents(report) == [("good", files["good.jpg"])]
+    assert report.skipped == [
+        ("icon.png", "too small: a side shorter than 20 px: 30x16"),
+        ("icon.depth.npy", "a depth map whose photo is not packed"),
+    ]
+    assert not verify(tmp_path / "shards", shortest_side_px=20).problems and verify(tmp_path / "all", shortest_side_px=20).problems
+
+
 def test_links_are_read_through_but_not_round_in_circles(photos, tmp_path):
     files = fill(tmp_path / "real", "a.jpg", "below/b.jpg")
     photos.mkdir()
@@ -124,6 +139,15 @@ def test_the_output_may_lie_in_the_folder_and_is_not_packed(photos):
     fill(photos, "a.jpg", "shards/old.jpg")
     assert [key for key, _ in contents(pack(photos, photos / "shards"))] == ["a"]
     assert [key for key, _ in contents(pack(photos, photos / "shards", overwrite=True))] == ["a"]
+
+
+def test_the_output_is_not_the_folder_of_photos_itself(photos, tmp_path):
+    fill(photos, "a.jpg")
+    (tmp_path / "link").symlink_to(photos)
+    for output in (photos, photos / ".", tmp_path / "link"):
+        with pytest.raises(ValueError, match="is the folder of photos itself; choose another one for the shards"):
+            pack(photos, output)
+    assert [path.name for path in photos.iterdir()] == ["a.jpg"]
 
 
 def test_existing_shards_are_kept_unless_told_otherwise(photos, tmp_path):
@@ -156,13 +180,13 @@ def test_a_pack_that_fails_leaves_nothing_behind(photos, tmp_path, monkeypatch):
     whole = pack(photos, output)
     before = Path(whole.shards[0]).read_bytes()
 
-    def fail(data, seen=[]):  # noqa: B006
+    def fail(data, shortest_side_px, seen=[]):  # noqa: B006
         seen.append(1)
         if len(seen) == 3:
             raise KeyboardInterrupt
-        return PhotoFile(data)
+        return usable_photo(data, shortest_side_px)
 
-    monkeypatch.setattr("zsdata.source.pack.PhotoFile", fail)
+    monkeypatch.setattr("zsdata.source.pack.usable_photo", fail)
     with pytest.raises(KeyboardInterrupt):
         pack(photos, output, photos_per_shard=1, overwrite=True)
     assert [path.name for path in output.iterdir()] == ["photos-000000.tar"]

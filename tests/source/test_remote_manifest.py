@@ -1,5 +1,7 @@
 """Sources behind a web server: the same manifest, photos and pairs as from a local disk, whatever the server does in between."""
 
+import threading
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +13,9 @@ from tests.test_stream import by_index, open_stream
 from zsdata.faults import BadShard
 from zsdata.source import http_ranges, ranges, retry
 from zsdata.source.archive import read_shard
-from zsdata.source.index import write_index
+from zsdata.source.index import load_or_list, write_index
 from zsdata.source.manifest import build_manifest
+from zsdata.source.retry import MissingShard
 from zsdata.source.shard_cache import ShardCache
 from zsdata.source.verify import verify
 
@@ -87,6 +90,84 @@ def test_an_index_of_a_remote_shard_is_used_until_the_shard_changes(server, remo
     assert (build_manifest(remote).checksums < 0).sum() == 5
     with pytest.raises(BadShard, match="changed since it was listed: ETag"):
         manifest.read(0)
+
+
+def test_shards_that_differ_in_their_query_have_indexes_of_their_own(server, local, tmp_path):
+    datas = [Path(path).read_bytes() for path in local]
+
+    def by_query(handler, file):
+        query = handler.path.partition("?")[2]
+        serve(handler, file._replace(data=datas[int(query[3])]))
+
+    server.always = by_query
+    url = server.put("download", b"")
+    urls = [f"{url}?id={number}&X-Amz-Signature=secret" for number in range(2)]
+    report = write_index(urls)
+    assert len(set(report.files)) == 2 and not any("secret" in Path(file).name + Path(file).read_text() for file in report.files)
+    signed_anew = [f"{url}?id={number}&X-Amz-Signature=other" for number in range(2)]
+    assert (write_index(signed_anew).unchanged, build_manifest(signed_anew).problems) == (2, ())
+    expected = build_manifest(local)
+    manifest = build_manifest(signed_anew)
+    assert [manifest.read(i) for i in range(len(manifest))] == [expected.read(i) for i in range(len(expected))]
+    assert (manifest.checksums >= 0).all()
+
+
+@pytest.fixture
+def long_walks(server, tmp_path, monkeypatch):
+    """Shards that take many requests to list."""
+    monkeypatch.setattr(ranges, "WINDOW_BYTES", 1 << 9)
+    data = Path(photo_tar(tmp_path / "long.tar", count=30)).read_bytes()
+    return [server.put(f"long-{number}.tar", data) for number in range(20)]
+
+
+def most_requests_of_one(server):
+    return max(Counter(request.path for request in server.requests).values())
+
+
+def test_where_a_shard_is_missing_no_read_of_the_others_goes_on(server, long_walks):
+    build_manifest(long_walks[0])
+    assert most_requests_of_one(server) > 30
+    server.requests.clear()
+    told = threading.Event()
+
+    def after_the_missing_one(handler, file):
+        if "missing" in handler.path:
+            answer(404)(handler, file)
+            told.set()
+        else:
+            told.wait(60)
+            handler.server.closing.wait(0.1)
+            serve(handler, file)
+
+    server.always = after_the_missing_one
+    with pytest.raises(MissingShard, match=r"missing\.tar: .*404"):
+        build_manifest([long_walks[0].replace("long-0", "missing"), *long_walks])
+    assert most_requests_of_one(server) < 10 and len({request.path for request in server.requests}) <= 17
+
+
+@pytest.mark.parametrize("retries", [False, True])
+def test_who_stops_listing_does_not_wait_for_the_shards_being_listed(server, long_walks, retries, monkeypatch):
+    monkeypatch.setattr(retry, "FIRST_PAUSE_SECONDS", 600.0)
+    monkeypatch.setattr(retry, "LONGEST_PAUSE_SECONDS", 600.0)
+    monkeypatch.setattr(retry, "GIVE_UP_SECONDS", 600.0)
+    gate = threading.Event()
+
+    def others_wait(handler, file):
+        if "long-0" not in handler.path:
+            gate.wait(60)
+            handler.server.closing.wait(0.1)
+            if retries:
+                answer(503)(handler, file)
+                return
+        serve(handler, file)
+
+    server.always = others_wait
+    listings = load_or_list(long_walks, [])
+    assert len(next(listings).keys) == 30
+    server.requests.clear()
+    gate.set()
+    listings.close()
+    assert not server.requests or most_requests_of_one(server) < 10
 
 
 def test_with_a_cache_every_photo_is_read_once_from_the_server(server, remote, tmp_path):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from zsdata.source.urls import _names_in, base_name, expand_urls, local_path, shown_url, without_secrets
+from zsdata.source.urls import _names_in, base_name, expand_urls, lasting_url, local_path, shown_url, without_secrets
 
 
 @pytest.fixture
@@ -128,6 +128,30 @@ def test_a_message_about_an_address_has_no_secrets():
         with pytest.raises(ValueError, match=r"https://h/") as caught:
             expand_urls(urls)
         assert "secret" not in str(caught.value)
+
+
+@pytest.mark.parametrize("spec", ["htps://user:secret@host/a.tar?token=secret", "simplecache::https://user:secret@host/a.tar?token=secret"])
+def test_an_address_of_no_known_kind_is_told_without_secrets(spec):
+    with pytest.raises(ValueError, match=r"host/a\.tar'") as caught:
+        expand_urls(spec)
+    assert "secret" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("url", "lasting"),
+    [
+        ("https://host/get?id=1", "https://host/get?id=1"),
+        ("https://u:pw@host/get?id=2&X-Amz-Signature=1&x-amz-date=2&expires=3&part=4#5", "https://host/get?id=2&part=4"),
+        ("https://host/a.tar?GoogleAccessId=1&Expires=2&Signature=3", "https://host/a.tar"),
+        ("https://host/a.tar?Policy=1&Key-Pair-Id=2&Signature", "https://host/a.tar"),
+        ("https://host/a.tar?sv=1&st=2024-01-01T00:00:00Z&se=2024-01-02T00%3A00%3A00Z&sig=2", "https://host/a.tar?sv=1"),
+        ("https://host/a.tar?st=1&access_token=2&tokens=3", "https://host/a.tar?st=1&tokens=3"),
+        ("s3://bucket/a.tar?versionId=1", "s3://bucket/a.tar?versionId=1"),
+        ("hf://model@main/a.tar", "hf://model@main/a.tar"),
+    ],
+)
+def test_what_signs_a_url_does_not_name_the_shard(url, lasting):
+    assert lasting_url(url) == lasting
 
 
 def test_the_name_of_a_shard_has_no_folder_and_no_token():

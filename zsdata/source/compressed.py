@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import Any, BinaryIO, cast
 
 from fsspec.compression import compr
-from fsspec.core import url_to_fs
 
 from zsdata.faults import BadShard
 from zsdata.progress import Progress
+from zsdata.source.ranges import ShardFile
+from zsdata.source.retry import UnreachableShard
 from zsdata.source.urls import base_name, expand_urls
 
 MAX_RATIO = 100  # of the plain to the compressed size; photos hardly compress, a bomb of gzip has 1,000, one of zstd 30,000
@@ -45,7 +47,8 @@ def decompress(
         The paths of the plain shards.
 
     Raises:
-        BadShard: a file is damaged, cut off, or grows beyond MAX_RATIO times its size.
+        BadShard: a file is damaged, cut off, grows beyond MAX_RATIO times its size, or changes while it is read.
+        OSError: a file cannot be read, or a shard not written; UnreachableShard for a remote file.
         ValueError: a file is not compressed with gzip or zstd, or two would get one name.
         FileExistsError: a shard is there already, without `overwrite`.
         ImportError: zstd, and neither Python 3.14 nor the package zstandard.
@@ -73,26 +76,41 @@ def decompress(
 
 
 def _decompress_one(url: str, target: Path) -> None:
-    file_system, path = url_to_fs(url)
-    with file_system.open(path, "rb") as source, open(target, "xb") as plain:
-        start = source.read(4)
+    with ShardFile(url) as file, open(target, "xb") as plain:
+        start = file.read_at(0, 4)
         kind, package = next(((kind, package) for signature, kind, package in _COMPRESSIONS if start.startswith(signature)), (None, ""))
         if kind is None:
-            raise ValueError(f"{url} is not compressed with gzip or zstd; a plain tar is used as it is")
+            raise ValueError(f"{file.url} is not compressed with gzip or zstd; a plain tar is used as it is")
         if kind not in compr:
-            raise ImportError(f"{url} is compressed with zstd: pip install {package}, or unpack it with unzstd")
-        source.seek(0)
-        limit = SMALL_BYTES + MAX_RATIO * file_system.size(path)
-        stream = cast(BinaryIO, compr[kind](source, mode="rb"))
+            raise ImportError(f"{file.url} is compressed with zstd: pip install {package}, or unpack it with unzstd")
+        limit = SMALL_BYTES + MAX_RATIO * file.size
+        stream = cast(BinaryIO, compr[kind](io.BufferedReader(_FromStart(file), CHUNK_BYTES), mode="rb"))
         try:
             with stream:
                 while chunk := stream.read(CHUNK_BYTES):
                     if plain.tell() + len(chunk) > limit:
-                        raise BadShard(f"a bomb: grows to more than {MAX_RATIO} times its size", url, 0)
+                        raise BadShard(f"a bomb: grows to more than {MAX_RATIO} times its size", file.url, 0)
                     plain.write(chunk)
         except EOFError as error:
-            raise BadShard("ends inside the compressed data; download it again", url, file_system.size(path)) from error
+            raise BadShard("ends inside the compressed data; download it again", file.url, file.size) from error
         except (zlib.error, OSError) as error:
-            if isinstance(error, OSError) and error.errno is not None:  # of the disk, not of the data
+            if isinstance(error, UnreachableShard) or getattr(error, "errno", None) is not None:  # of the network or disk, not of the data
                 raise
-            raise BadShard(f"damaged {kind} data ({error}); download it again", url, 0) from error
+            raise BadShard(f"damaged {kind} data ({error}); download it again", file.url, 0) from error
+
+
+class _FromStart(io.RawIOBase):
+    """An open file as what decompressors read: from its start, a piece at a time."""
+
+    def __init__(self, file: ShardFile) -> None:
+        self._file = file
+        self._position = 0
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        data = self._file.read_at(self._position, len(buffer))
+        buffer[: len(data)] = data
+        self._position += len(data)
+        return len(data)

@@ -11,6 +11,7 @@ from fsspec.core import url_to_fs
 
 from zsdata.source import retry
 from zsdata.source.retry import MISSING_CURE, REFUSED_CURE, MissingShard, RefusedShard, RemoteFault, Stamp, fault_of_status
+from zsdata.source.stop import check_stop
 from zsdata.source.time_limit import within
 from zsdata.source.urls import without_secrets
 
@@ -41,6 +42,7 @@ def fetch_fsspec(url: str, offset: int, size: int, data: bytearray, check: Calla
     assert isinstance(total, int)
     end = min(offset + size, total)
     while offset < end:
+        check_stop()
         stop = min(end, offset + PIECE_BYTES)
         piece = _call(lambda start=offset, stop=stop: file_system.cat_file(path, start=start, end=stop), limit)
         limit = time.monotonic() + retry.STALL_SECONDS

@@ -24,6 +24,7 @@ from urllib.request import getproxies, proxy_bypass
 
 from zsdata.source import retry
 from zsdata.source.retry import RemoteFault, Stamp, fault_of_status
+from zsdata.source.stop import check_stop
 from zsdata.source.time_limit import within
 from zsdata.source.urls import HTTP
 
@@ -223,6 +224,7 @@ def _take_bytes(response: HTTPResponse, channel: socket.socket, count: int, data
     """Appends the next `count` bytes of the body to `data`; a connection that moves as good as nothing for too long has stalled."""
     recent, left = 0, count
     while left:
+        check_stop()
         channel.settimeout(max(0.01, limit - time.monotonic()))
         chunk = response.read1(min(left, CHUNK_BYTES))
         if not chunk:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import threading
 import zlib
 from array import array
 from collections.abc import Iterable, Sequence
@@ -17,7 +18,8 @@ from zsdata.progress import Progress
 from zsdata.source.archive import MAX_PHOTO_BYTES, DepthMember, Problem, header_inside, photo_members
 from zsdata.source.ranges import ShardFile
 from zsdata.source.retry import Stamp
-from zsdata.source.urls import base_name, expand_urls, local_path, shown_url
+from zsdata.source.stop import stoppable
+from zsdata.source.urls import base_name, expand_urls, lasting_url, local_path, shown_url
 
 INDEX_ENDING = ".index.json"
 VERSION = 2  # 1 had no depth maps
@@ -176,7 +178,11 @@ def load_listing(url: str, *, even_if_touched: bool = False) -> Listing | None:
 
 
 def load_or_list(urls: Sequence[str], stale: list[str]) -> Iterable[Listing]:
-    """The listing of each shard in order, from its index where it has one; adds to `stale` why an index was not used."""
+    """The listing of each shard in order, from its index where it has one; adds to `stale` why an index was not used.
+
+    Where it ends early, by an error of a shard or of the caller, no read of another shard goes on.
+    """
+    stop = threading.Event()
 
     def one(url: str) -> Listing:
         try:
@@ -186,17 +192,24 @@ def load_or_list(urls: Sequence[str], stale: list[str]) -> Iterable[Listing]:
             listing = None
         return list_shard(url) if listing is None else listing
 
+    def one_of_many(url: str) -> Listing:
+        with stoppable(stop):
+            return one(url)
+
     if all(local_path(url) is not None for url in urls):
         yield from map(one, urls)
         return
     with ThreadPoolExecutor(REMOTE_AT_ONCE) as threads:
-        yield from threads.map(one, urls)
+        try:
+            yield from threads.map(one_of_many, urls)
+        finally:
+            stop.set()  # else leaving the pool waits for the whole of the shards that are being listed
 
 
 def _places(url: str) -> list[str]:
     """Where the index of a shard may be, the first one preferred."""
     path = local_path(url)
-    identity = os.path.realpath(path) if path is not None else url.split("?", 1)[0]
+    identity = os.path.realpath(path) if path is not None else lasting_url(url)
     cached = f"{hashlib.sha256(identity.encode('utf-8', 'surrogateescape')).hexdigest()[:32]}-{base_name(url)}{INDEX_ENDING}"
     cache = os.environ.get("ZSDATA_CACHE") or os.path.join(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "zsdata")
     return [*([] if path is None else [f"{path}{INDEX_ENDING}"]), os.path.join(cache, "index", cached)]

@@ -15,7 +15,7 @@ from zsdata.progress import Progress
 from zsdata.source.archive import DEPTH_EXTENSIONS, MAX_PHOTO_BYTES, OTHER_IMAGE_EXTENSIONS, PHOTO_EXTENSIONS
 from zsdata.source.depth_map import DepthMap, decode_depth
 from zsdata.source.index import INDEX_ENDING
-from zsdata.source.photo import PhotoFile, probe_photo
+from zsdata.source.photo import probe_photo, usable_photo
 
 _BLOCK = 512
 _DEPTH_FILE = re.compile(rf"(.+)\.({'|'.join(map(re.escape, DEPTH_EXTENSIONS))})", re.IGNORECASE | re.DOTALL)
@@ -38,6 +38,7 @@ def pack(
     output: str | os.PathLike[str],
     *,
     photos_per_shard: int = 1000,
+    shortest_side_px: int = 1,
     overwrite: bool = False,
     progress: bool | None = None,
 ) -> PackReport:
@@ -50,13 +51,14 @@ def pack(
     files that are no images are passed over; symbolic links are read through.
 
     Args:
+        shortest_side_px: a photo with a shorter side is left out.
         overwrite: replace shards that `pack` made before under the same name.
         progress: show a progress bar; by default where stderr is a terminal.
 
     Raises:
         NotADirectoryError: `folder` is no folder.
         FileExistsError: `output` already holds tars.
-        ValueError: there is no photo to pack, or `photos_per_shard` is not positive.
+        ValueError: there is no photo to pack, `output` is `folder`, or `photos_per_shard` is not positive.
     """
     source, target = Path(folder), Path(output)
     if not source.is_dir():
@@ -64,7 +66,7 @@ def pack(
     if photos_per_shard < 1:
         raise ValueError(f"photos_per_shard is at least 1, got {photos_per_shard}")
     name = re.sub(r"[^A-Za-z0-9_-]", "_", source.resolve().name) or "photos"
-    _check_output(target, name, overwrite)
+    _check_output(source, target, name, overwrite)
     files = sorted(_files(source, target), key=os.fsencode)
     photos = [path for path in files if not _DEPTH_FILE.fullmatch(path)]
     depths = _DepthFiles(source, [path for path in files if _DEPTH_FILE.fullmatch(path)])
@@ -73,7 +75,7 @@ def pack(
     with _Shards(target, name, photos_per_shard) as shards:
         for path in Progress(photos, desc="packing", unit="photo", disable=None if progress is None else not progress):
             try:
-                data, extension = _read_photo(source / path)
+                data, extension = _read_photo(source / path, shortest_side_px)
             except BadPhoto as fault:
                 report.skipped.append((path, fault.reason))
                 continue
@@ -182,9 +184,11 @@ class _Shards:
             path.unlink(missing_ok=True)
 
 
-def _check_output(target: Path, name: str, overwrite: bool) -> None:
+def _check_output(source: Path, target: Path, name: str, overwrite: bool) -> None:
     if target.exists() and not target.is_dir():
         raise NotADirectoryError(f"{target} is not a folder; pack writes its shards into a folder")
+    if os.path.realpath(source) == os.path.realpath(target):
+        raise ValueError(f"{target} is the folder of photos itself; choose another one for the shards, such as {target / 'shards'}")
     present = sorted(target.glob("*.tar")) if target.exists() else []
     if present and not overwrite:
         raise FileExistsError(f"{target} already holds {present[0].name}; choose another folder, or allow to overwrite")
@@ -212,12 +216,10 @@ def _files(source: Path, output: Path, ancestors: tuple[str, ...] = (), below: s
                 yield below + entry.name
 
 
-def _read_photo(path: Path) -> tuple[bytes, str]:
+def _read_photo(path: Path, shortest_side_px: int) -> tuple[bytes, str]:
     """A photo's bytes and the extension that fits them; BadPhoto if zsdata cannot use it."""
     data = _read_file(path)
-    photo = PhotoFile(data)
-    photo.decode()
-    return data, photo.extension
+    return data, usable_photo(data, shortest_side_px).extension
 
 
 def _read_file(path: Path) -> bytes:

@@ -115,6 +115,16 @@ class PhotoFile:
         return make_upright(image, photo.orientation)
 
 
+def usable_photo(data: bytes, shortest_side_px: int = 1) -> PhotoFile:
+    """A photo that was decoded to see whether it can be; BadPhoto as `decode_photo`, or where a side is shorter."""
+    photo = PhotoFile(data)
+    photo.decode()
+    width, height, _ = photo.header
+    if min(width, height) < shortest_side_px:
+        raise BadPhoto(f"too small: a side shorter than {shortest_side_px} px: {width}x{height}")
+    return photo
+
+
 def probe_photo(data: bytes) -> PhotoHeader:
     """The header of a photo, without decoding it; raises as `PhotoFile`."""
     return PhotoFile(data).header

@@ -10,6 +10,7 @@ from zsdata.source.fsspec_ranges import fetch_fsspec, look_anew
 from zsdata.source.http_ranges import fetch_http
 from zsdata.source.retry import Stamp, check_unchanged, read_patiently
 from zsdata.source.shard_cache import ShardCache
+from zsdata.source.stop import check_stop
 from zsdata.source.urls import HTTP, local_path, shown_url
 
 FIRST_BYTES = 1 << 16  # of a remote shard, to learn its size; on most lines they take no longer than one byte
@@ -59,7 +60,9 @@ class ShardFile:
         Raises:
             ChangedShard: a remote shard is no longer the one that was opened. (A local one that is replaced stays open as it was.)
             UnreachableShard: a remote shard cannot be read any more.
+            Stopped: see `stoppable`.
         """
+        check_stop()
         size = min(size, self.size - offset)
         if size <= 0:
             return b""

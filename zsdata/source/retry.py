@@ -11,6 +11,7 @@ from http import HTTPStatus
 from typing import Protocol
 
 from zsdata.faults import BadShard
+from zsdata.source.stop import check_stop, pause
 from zsdata.source.urls import shown_url
 
 STALL_SECONDS = 10.0  # one try: to the first bytes, and then from some to the next ones; a healthy bucket answers within 5 s
@@ -96,6 +97,7 @@ def read_patiently(url: str, offset: int, size: int, fetch: Fetch, stamp: Stamp 
     Raises:
         ChangedShard: it is another one now, or became another one between two tries; no byte of the two is ever put together.
         UnreachableShard: MissingShard, RefusedShard or another, within 60 s of the first sign of a fault.
+        Stopped: see `stoppable`.
     """
     data = bytearray()
 
@@ -109,6 +111,7 @@ def read_patiently(url: str, offset: int, size: int, fetch: Fetch, stamp: Stamp 
     faults: Counter[str] = Counter()
     start = give_up_at = time.monotonic()
     while len(data) < size:
+        check_stop()
         try:
             if fetch(url, offset + len(data), size - len(data), data, check):
                 break
@@ -120,11 +123,11 @@ def read_patiently(url: str, offset: int, size: int, fetch: Fetch, stamp: Stamp 
             if not fault.again or now >= give_up_at:
                 what = f"bytes {offset:,} to {offset + size:,}" + (f" ({len(data):,} of them came)" if data else "")
                 raise fault.error(_said(url, what, faults, now - start, fault)) from None
-            pause = min(LONGEST_PAUSE_SECONDS, FIRST_PAUSE_SECONDS * 2 ** min(faults.total() - 1, 30))
+            seconds = min(LONGEST_PAUSE_SECONDS, FIRST_PAUSE_SECONDS * 2 ** min(faults.total() - 1, 30))
             if fault.wait_seconds is not None:
-                pause = max(pause, fault.wait_seconds)
+                seconds = max(seconds, fault.wait_seconds)
             # Jitter, so that workers which failed together do not come back together; it changes no byte.
-            time.sleep(min(pause * random.uniform(1.0, 1.5), give_up_at - now))
+            pause(min(seconds * random.uniform(1.0, 1.5), give_up_at - now))
     assert stamp is not None  # a fetch that returns has said it
     return bytes(data), stamp
 

@@ -20,6 +20,12 @@ LARGEST_NUMBER = 1e15  # in a range
 _NUMBERS = re.compile(r"(-?\d+)\.\.(-?\d+)(?:\.\.-?(\d+))?")
 _LETTERS = re.compile(r"([A-Za-z])\.\.([A-Za-z])(?:\.\.-?\d+)?")
 
+_SIGNING = re.compile(  # parts of a query that change at each signing: S3, Google, CloudFront, Alibaba, and the times of Azure
+    r"(x-(amz|goog|oss)-.*|signature|sig|expires|policy|key-pair-id|(aws|oss)accesskeyid|googleaccessid|((access|auth)_|security-)?token)(=.*)?"
+    r"|sk?[et]=\d{4}-\d\d-\d\dT.*",
+    re.IGNORECASE | re.DOTALL,
+)
+
 HTTP = ("http", "https")  # the protocols that are spoken here; fsspec speaks the others
 
 
@@ -46,6 +52,15 @@ def shown_url(url: str) -> str:
         rest = re.split(r"[?#]", rest, maxsplit=1)[0]
     host, slash, path = rest.partition("/")
     return f"{protocol}://{host.rpartition('@')[2]}{slash}{path}"
+
+
+def lasting_url(url: str) -> str:
+    """What names a shard after each signing of its url: of an http address all but user, password and what signs its query."""
+    if url.partition("://")[0] not in HTTP:
+        return url
+    query = url.partition("#")[0].partition("?")[2]
+    lasting = "&".join(part for part in query.split("&") if not _SIGNING.fullmatch(part))
+    return shown_url(url) + (f"?{lasting}" if lasting else "")
 
 
 def without_secrets(text: str) -> str:
@@ -102,11 +117,14 @@ def _expand_one(spec: str) -> list[str]:
     for url in names:
         if url.startswith("pipe:"):
             raise ValueError(
-                f"{url!r}: pipe: urls run shell commands, and what comes out of a pipe cannot be read by range: they are always refused; "
-                "name the tar itself (a path, http, s3, gs or hf url)"
+                f"{without_secrets(url)!r}: pipe: urls run shell commands, and what comes out of a pipe cannot be read by range: they are "
+                "always refused; name the tar itself (a path, http, s3, gs or hf url)"
             )
         if "::" in url and url.split("://", 1)[0] not in HTTP:  # [::1] is a host
-            raise ValueError(f'{url!r}: "::" is not supported; give a list of urls, or for chained file systems the url of the tar itself')
+            raise ValueError(
+                f'{without_secrets(url)!r}: "::" is not supported; give a list of urls, or for chained file systems the url of the '
+                "tar itself"
+            )
         path = local_path(url)
         shards += _remote_shards(url, spec) if path is None else _local_shards(path, url, spec)
     return shards
@@ -166,7 +184,8 @@ def _remote_shards(url: str, spec: str) -> list[str]:
     except ImportError:  # known, but its package is missing: an error when a shard is opened
         pass
     except ValueError as error:
-        raise ValueError(f"{spec!r}: {protocol}:// is no kind of url that fsspec knows; use http, https, s3, gs, hf or a path") from error
+        shown = shown_url(spec).partition("?")[0]  # a slip of https:// may be followed by a token
+        raise ValueError(f"{shown!r}: {protocol}:// is no kind of url that fsspec knows; use http, https, s3, gs, hf or a path") from error
     return [url]
 
 

@@ -12,7 +12,7 @@ from zsdata.progress import Progress
 from zsdata.source.archive import DepthMember, Problem, photo_members
 from zsdata.source.depth_map import DepthMap, misfit
 from zsdata.source.index import CHANGED_BYTES, CHANGED_DEPTH, NO_DEPTH, StaleIndex, load_listing
-from zsdata.source.photo import PhotoFile, PhotoHeader
+from zsdata.source.photo import PhotoHeader, usable_photo
 from zsdata.source.ranges import ShardFile
 from zsdata.source.urls import base_name, expand_urls, shown_url
 
@@ -22,6 +22,7 @@ class VerifyReport:
     """What was looked at, and what is wrong with it."""
 
     shards: int = 0
+    opened: int = 0  # shards of which something could be read
     photos: int = 0  # those that decode
     depth_maps: int = 0  # those that decode and fit such a photo
     bytes: int = 0  # of the shards
@@ -67,6 +68,7 @@ def verify(
             shown = shown_url(url)
             try:
                 with ShardFile(url) as file:
+                    report.opened += 1
                     report.bytes += file.size
                     indexed = _Indexed(url, add)
                     report.indexed += indexed.found
@@ -76,7 +78,7 @@ def verify(
                         data = file.read_at(offset, size)
                         changed = indexed.reason_against(key, data)
                         try:
-                            header = _header_of_decodable(data, shortest_side_px)
+                            header = usable_photo(data, shortest_side_px).header
                             if changed is not None:
                                 raise BadPhoto(changed)
                             headers[key] = header
@@ -183,13 +185,3 @@ class _Indexed:
         for key, (offset, _) in self._depths.items():
             if key in photos:
                 self._add(Problem(self._url, key, offset, "depth map lost: it was there when the shard was indexed"))
-
-
-def _header_of_decodable(data: bytes, shortest_side_px: int) -> PhotoHeader:
-    """What the header of a photo says; BadPhoto where the photo cannot be used."""
-    photo = PhotoFile(data)
-    photo.decode()
-    width, height, _ = photo.header
-    if min(width, height) < shortest_side_px:
-        raise BadPhoto(f"too small: a side shorter than {shortest_side_px} px: {width}x{height}")
-    return photo.header
