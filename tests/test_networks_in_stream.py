@@ -13,6 +13,7 @@ from tests.small_pipeline import save_small_pipeline
 from tests.source.http_server import ScriptedServer
 from zsdata import QualityGate, ZeroStereoStream, load_depth
 from zsdata.licences import NonCommercialModel
+from zsdata.source import http_ranges
 from zsdata.synthesis.depth import DepthNetwork
 from zsdata.synthesis.depth.pretrained import PretrainedDepth
 from zsdata.synthesis.inpaint import DiffusionNetwork
@@ -170,6 +171,7 @@ from pathlib import Path
 import zsdata.stream
 from zsdata import ZeroStereoStream
 from zsdata.licences import NonCommercialModel
+from zsdata.source import http_ranges
 
 first = ZeroStereoStream({str(tar)!r}, depth="somebody/depth", commercial_safe=True)
 assert first.provenance()["depth"][0]["licence"] == "mit"
@@ -273,6 +275,7 @@ def test_shards_that_differ_in_their_query_alone_keep_their_depth_apart(folder, 
             ]
             for place in ("worker", "device")
         ]
+        http_ranges.close_connections()
     assert made[0] and all(torch.allclose(one, other, atol=1e-4) for one, other in zip(*made, strict=True))
 
 
