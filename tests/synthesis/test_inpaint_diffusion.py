@@ -598,6 +598,15 @@ def test_a_compiled_network_takes_single_images_as_such_where_it_was_made_ready_
     assert seen == [1, 8, 8]
 
 
+@pytest.mark.parametrize("scheduler", ["ddim", "lcm"])
+def test_latents_are_not_clipped_whatever_the_pipelines_scheduler_says(folder, copy, scheduler):
+    """As one saved by DDPMScheduler says without a word of its maker's; latents reach far beyond -1..1."""
+    change(copy / "scheduler" / "scheduler_config.json", clip_sample=True)
+    clipped, expected = (load_inpainter(path, steps=2, scheduler=scheduler) for path in (copy, folder))
+    right, inpaint_mask = scenes(1)
+    assert torch.equal(clipped(right, inpaint_mask, generators(0)), expected(right, inpaint_mask, generators(0)))
+
+
 def test_no_samples_are_no_work(inpainter):
     right, inpaint_mask = scenes(1)
     assert inpainter(right[:0], inpaint_mask[:0], []).shape == (0, 3, 48, 64)
