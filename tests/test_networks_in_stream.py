@@ -230,7 +230,8 @@ def test_a_name_with_a_revision_is_both(tmp_path):
         "owner/name", revision="v1", autoencoder="a/b", autoencoder_revision="v2"
     )
     (tmp_path / "at@home").mkdir()
-    assert DepthNetwork(str(tmp_path / "at@home")).name == str(tmp_path / "at@home")
+    for path in (str(tmp_path / "at@home"), "/no/such/at@home"):
+        assert DepthNetwork(path).name == path
     with pytest.raises(ValueError, match='"owner/name@v1" names a revision, and revision="v2" another'):
         DepthNetwork("owner/name@v1", revision="v2")
     with pytest.raises(ValueError, match="autoencoder_revision belongs to an autoencoder, and none is named"):

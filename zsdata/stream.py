@@ -393,11 +393,18 @@ class ZeroStereoStream(IterableDataset):
     def _warm_up(self, finisher: Finisher, device: torch.device, batch_size: int, aloud: bool) -> None:
         """Makes the networks on the device ready for batches like the first ones."""
         size = self._recipe.size
-        see_whole_photos = size is None or finisher.synthesis is not None
-        photos = self._worker.photo_sizes(self._epoch, WARM_UP_PHOTOS) if see_whole_photos else []
-        if see_whole_photos and not photos:
-            return  # not one of them can be used, as the first batch will say
-        ready = finisher.warm_up(size or max(photos, key=math.prod), photos, batch_size)
+        see_whole_photos = [] if finisher.synthesis is None else [finisher.synthesis.depth]
+        if size is None:
+            see_whole_photos.append(finisher.inpainter)
+        photos = []
+        if any(hasattr(step, "warm_up") for step in see_whole_photos):
+            photos = self._worker.photo_sizes(self._epoch, WARM_UP_PHOTOS)
+            if not photos:
+                return  # not one of them can be used, as the first batch will say
+            size = size or max(photos, key=math.prod)
+        if size is None:
+            return  # nothing that is to get ready
+        ready = finisher.warm_up(size, photos, batch_size)
         if ready and aloud:
             Progress.write(say_warm_up(ready, device, len(photos)), file=sys.stderr)
 

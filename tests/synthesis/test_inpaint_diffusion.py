@@ -569,10 +569,9 @@ def test_a_compiled_network_that_runs_out_of_memory_takes_half_of_what_it_was_fi
 
 @pytest.mark.filterwarnings("ignore:.*script_method.*:DeprecationWarning")  # PyTorch's own compiler
 def test_auto_tries_a_compiled_network_as_it_is(folder, monkeypatch):
-    compiled, seen = load_inpainter(folder, steps=1, compile=True, memory_gib=1.2), []
+    compiled = load_inpainter(folder, steps=1, compile=True, memory_gib=1.2)
     pretend_gpu(compiled, 1)
-    unet = compiled._unet.forward
-    monkeypatch.setattr(compiled._unet, "forward", lambda noisy, *_, **__: seen.append(len(noisy)) or unet(noisy, *_, **__))
+    seen = count_unet(compiled, monkeypatch)
     for module in (diffusion, micro_batch):
         monkeypatch.setattr(module, "measure", lambda work, device: (work(), (seen[-1] * 2**28, 0.5))[1])
     with torch.compiler.set_stance("force_eager"):
@@ -585,10 +584,9 @@ def test_auto_tries_a_compiled_network_as_it_is(folder, monkeypatch):
 
 @pytest.mark.filterwarnings("ignore:.*script_method.*:DeprecationWarning")  # PyTorch's own compiler
 def test_a_compiled_network_takes_single_images_as_such_where_it_was_made_ready_for_them(folder, monkeypatch):
-    compiled, seen = load_inpainter(folder, steps=1, compile=True, micro_batch=8), []
+    compiled = load_inpainter(folder, steps=1, compile=True, micro_batch=8)
     pretend_gpu(compiled, 8)
-    unet = compiled._unet.forward
-    monkeypatch.setattr(compiled._unet, "forward", lambda noisy, *_, **__: seen.append(len(noisy)) or unet(noisy, *_, **__))
+    seen = count_unet(compiled, monkeypatch)
     with torch.compiler.set_stance("force_eager"):
         for samples in (1, 8):
             compiled.warm_up((48, 64), samples)

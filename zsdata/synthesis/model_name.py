@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
+
+AT_REVISION = re.compile(r"([\w.-]+(?:/[\w.-]+)?)@([\w./-]+)")  # a Hub id and a branch, tag or commit; a path otherwise
 
 
 def split_revision(name: str, revision: str | None) -> tuple[str, str | None]:
@@ -11,9 +14,9 @@ def split_revision(name: str, revision: str | None) -> tuple[str, str | None]:
     Raises:
         ValueError: there are two revisions.
     """
-    if "@" not in name or os.path.isdir(name):
+    both = None if os.path.isdir(name) else AT_REVISION.fullmatch(name)
+    if both is None:
         return name, revision
-    plain, _, at = name.rpartition("@")
     if revision is not None:
         raise ValueError(f'"{name}" names a revision, and revision="{revision}" another; leave one of them out')
-    return plain, at
+    return both[1], both[2]
