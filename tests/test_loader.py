@@ -121,6 +121,25 @@ def test_swapped_sources_reach_workers_that_have_prefetched(tmp_path):
         assert {meta["source"] for batch in loader for meta in batch.meta} == {"b"}
 
 
+@pytest.mark.parametrize("inside", [True, False])
+def test_an_epoch_that_a_swap_leaves_nothing_of_is_over(tmp_path, inside):
+    """A trainer that asks for epoch after epoch would otherwise be given nothing for ever."""
+    stream = open_stream(photo_tar(tmp_path / "a.tar", 8))
+    few = photo_tar(tmp_path / "b.tar", 4, first_seed=50)
+    with stream.loader(2) as loader:
+        list(loader)
+        loop = iter(loader)
+        for _ in range(3):
+            next(loop)
+        if not inside:
+            loop.close()
+        stream.set_sources(few, epoch=1)
+        assert list(loop) == []
+        if not inside:
+            assert list(loader) == []
+        assert loader.epoch == 2 and indices(loader) == [(2, 0), (2, 1), (2, 2), (2, 3)]
+
+
 def test_accelerate_leaves_the_loader_alone_and_sees_the_end_of_the_epoch(tar):
     accelerator = Accelerator(cpu=True, gradient_accumulation_steps=3)
     with open_stream(tar).loader(3) as loader:

@@ -134,6 +134,7 @@ class StereoLoader:
                 yield batch
                 if last or self._epoch != epoch:
                     return
+            self._epoch, self._samples = epoch + 1, 0  # a swap of its sources has left nothing of the epoch
         except GeneratorExit:
             raise
         except BaseException as error:  # KeyboardInterrupt too: what was prefetched no longer follows the place
