@@ -3,6 +3,7 @@ import json
 import logging
 from itertools import islice
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -125,6 +126,28 @@ def test_persistent_dataloader_workers_move_on_by_themselves(tar):
     loader = DataLoader(open_stream(tar), batch_size=None, num_workers=2, persistent_workers=True)
     epochs = [{pair.meta["epoch"] for pair in loader} for _ in range(3)]
     assert epochs == [{0}, {1}, {2}]
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
+def test_persistent_dataloader_workers_stay_in_one_epoch_after_a_loop_that_was_broken_off(tar):
+    """Batches are fetched ahead, so that one worker is at its end by then and the other is not."""
+    loader = DataLoader(open_stream(tar), batch_size=None, num_workers=3, persistent_workers=True, prefetch_factor=2)
+    for number, _ in enumerate(loader):
+        if number == 7:
+            break
+    epochs = [sorted((pair.meta["epoch"], pair.meta["index"]) for pair in loader) for _ in range(2)]
+    assert epochs == [[(epoch, index) for index in range(12)] for epoch in (1, 2)]
+
+
+@pytest.mark.parametrize("taken", [1, 5])
+def test_the_place_of_a_worker_follows_its_pairs(tar, monkeypatch, taken):
+    """As data loaders ask for it that save the state of their workers."""
+    monkeypatch.setattr("zsdata.stream.get_worker_info", lambda: SimpleNamespace(id=1, num_workers=2))
+    stream, resumed = open_stream(tar), open_stream(tar)
+    first = list(islice(stream, taken))
+    resumed.load_state_dict(stream.state_dict())
+    assert [pair.meta["index"] for pair in [*first, *resumed]] == [1, 3, 5, 7, 9, 11]
+    assert resumed.state_dict()["epoch"] == 1
 
 
 def test_another_seed_gives_other_pairs(tar, plain):

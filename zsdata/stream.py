@@ -65,7 +65,8 @@ class ZeroStereoStream(IterableDataset):
     the next one when iterated again; `loader` gives finished batches on a device, made ahead by worker processes.
 
     Inside a torch DataLoader with workers each worker makes its share of the samples. There, torch copies the stream to new workers for
-    every epoch, so say which epoch it is: `stream.set_epoch(epoch)`; with `persistent_workers=True` the workers count for themselves.
+    every epoch, so say which epoch it is: `stream.set_epoch(epoch)`; with `persistent_workers=True` the workers count for themselves, and
+    a loop that is broken off ends its epoch. Such a loader knows nothing of ranks, and `state_dict` nothing of its place: `loader` does.
 
     Args:
         sources: tars of photos: a path, url or pattern ("shards/{000..099}.tar"), a list of such, named and weighted sources
@@ -207,6 +208,7 @@ class ZeroStereoStream(IterableDataset):
         self._meter = Meter()
         self._epoch = 0
         self._samples = 0
+        self._loop_is_open = False  # over a DataLoader worker's share
 
     def __len__(self) -> int:
         """Samples in the epoch that comes next."""
@@ -219,7 +221,14 @@ class ZeroStereoStream(IterableDataset):
     def __iter__(self) -> Iterator[StereoBatch]:
         """The finished pairs of an epoch, on the CPU, without a batch axis; from where the last loop stopped."""
         info = get_worker_info()
-        share, shares = (info.id, info.num_workers) if info else (0, 1)
+        if info is None:
+            return self._pairs(0, 1)
+        if self._loop_is_open:  # pairs are fetched ahead, so the workers stand at different places, or one of them in the next epoch
+            self._epoch, self._samples = self._epoch + 1, 0
+        self._loop_is_open = True
+        return self._pairs(info.id, info.num_workers)
+
+    def _pairs(self, share: int, shares: int) -> Iterator[StereoBatch]:
         epoch = self._epoch
         for index in range(self._samples, self.epoch_size(epoch)):
             if index // self._samples_per_photo % shares != share:  # what is made from one photo stays together
@@ -230,12 +239,14 @@ class ZeroStereoStream(IterableDataset):
             if self._epoch != epoch:
                 return  # another loop or a set_epoch has moved the stream on
         self._epoch, self._samples = epoch + 1, 0
+        self._loop_is_open = False
 
     def set_epoch(self, epoch: int) -> None:
         """The next loop over the stream gives this epoch, from its first sample."""
         if epoch < 0:
             raise ValueError(f"an epoch is 0 or more; got {epoch}")
         self._epoch, self._samples = epoch, 0
+        self._loop_is_open = False
 
     def set_sources(self, sources: Any, *, epoch: int) -> None:
         """Uses other sources from `epoch` on; loaders follow by themselves.
@@ -327,6 +338,7 @@ class ZeroStereoStream(IterableDataset):
         """
         place = Position.from_state(state, self._place(0, 0), self.epoch_size)
         self._epoch, self._samples = place.epoch, place.samples
+        self._loop_is_open = False
 
     def stats(self) -> dict[str, Any]:
         """What the loop over the stream itself has seen, as `StereoLoader.stats` says it."""
