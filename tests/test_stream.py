@@ -387,6 +387,41 @@ def test_problems_of_the_shards_are_said_and_counted(tmp_path, caplog):
     assert "1 faults in the shards" in caplog.text
 
 
+def test_a_swap_looks_at_the_folder_as_it_is_now(tar, tmp_path):
+    folder = tmp_path / "shards"
+    folder.mkdir()
+    photo_tar(folder / "a.tar", 4)
+    stream = open_stream(str(folder))
+    photo_tar(folder / "b.tar", 3, first_seed=50)
+    stream.set_sources(str(folder), epoch=1)
+    assert [stream.epoch_size(epoch) for epoch in (0, 1)] == [4, 7]
+    photo_tar(folder / "a.tar", 2, first_seed=90)
+    stream.set_sources(str(folder), epoch=2)
+    stream.set_epoch(2)
+    assert len(list(stream)) == 5 and not stream.stats()["rejected"]
+
+
+def test_a_swap_to_shards_that_are_the_same_does_not_walk_them_again(tar, monkeypatch):
+    stream = open_stream(tar)
+    monkeypatch.setattr("zsdata.sources.build_manifest", None)
+    stream.set_sources({"other name": tar}, epoch=1)
+    assert stream.epoch_size(1) == 12
+
+
+def test_a_source_that_gives_no_photo_is_told(tar, tmp_path, caplog):
+    few = photo_tar(tmp_path / "few.tar", 2)
+    open_stream({"many": ImageSource(tar, weight=0.99), "few": ImageSource(few, weight=0.01)}, epoch_size=40)
+    assert 'source "few"' in caplog.text and "no photo" in caplog.text
+    caplog.clear()
+    open_stream({"many": ImageSource(tar, weight=1), "few": ImageSource(few, weight=0)}, epoch_size=40)
+    assert caplog.text == ""
+
+
+def test_several_sources_need_names(tar):
+    with pytest.raises(TypeError, match=r'a list holds urls, and several ImageSource are named: \{"indoor": ImageSource'):
+        open_stream([ImageSource(tar), ImageSource(tar)])
+
+
 def test_problems_of_swapped_shards_are_said_and_counted_too(tar, tmp_path, caplog):
     other = write_tar(tmp_path / "b.tar", {"a.jpg": jpeg(photo(1)), "b.tif": b"II*\0"})
     stream = open_stream(tar)

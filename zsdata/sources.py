@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from zsdata.plan import EpochPlan, quotas_for
+from zsdata.source.archive import Problem
 from zsdata.source.manifest import Manifest, build_manifest
 from zsdata.source.urls import shown_url
 from zsdata.synthesis.depth.options import STORED
@@ -104,6 +105,7 @@ class Schedule:
         self._samples_per_photo = samples_per_photo
         self._stored_depth = stored_depth
         self._manifests: dict[str, Manifest] = {}
+        self._problems: dict[Problem, None] = {}  # each once, in the order in which they were found
         by_epoch = _by_epoch(sources)
         self._starts = sorted(by_epoch)
         self._sets = [self._open(by_epoch[start]) for start in self._starts]
@@ -122,9 +124,9 @@ class Schedule:
         self._sets = [*(self._sets[i] for i in kept), opened]
 
     @property
-    def problems(self) -> list[Any]:
+    def problems(self) -> list[Problem]:
         """What was wrong with the shards, over all sources."""
-        return [problem for manifest in self._manifests.values() for problem in manifest.problems]
+        return list(self._problems)
 
     @property
     def digest(self) -> str:
@@ -146,13 +148,21 @@ class Schedule:
             logger.warning("without epoch_size an epoch is one pass over the photos and the sources' weights change nothing; set it")
         photos = None if self._epoch_size is None else math.ceil(self._epoch_size / self._samples_per_photo)
         quotas = quotas_for(sizes, [source.weight for source in named.values()], photos)
+        for (name, source), quota in zip(named.items(), quotas, strict=True):
+            if not quota and source.weight != 0:
+                logger.warning(
+                    'source "%s" gives no photo: its share is less than one of the %d that make an epoch; raise its weight or epoch_size',
+                    name,
+                    sum(quotas),
+                )
         plan = EpochPlan(self._seed, tuple(named), sizes, quotas, self._samples_per_photo, self._epoch_size)
         return SourceSet(tuple(named), manifests, plan)
 
     def _manifest(self, urls: Any) -> Manifest:
         key = repr(urls)
-        if key not in self._manifests:
-            self._manifests[key] = build_manifest(urls)
+        if key not in self._manifests or not self._manifests[key].is_current(urls):  # a folder may have grown since
+            self._manifests[key] = manifest = build_manifest(urls)
+            self._problems |= dict.fromkeys(manifest.problems)
         return self._manifests[key]
 
 
@@ -187,6 +197,8 @@ def _by_epoch(sources: Any) -> dict[int, Any]:
 def _by_name(sources: Any) -> dict[str, ImageSource]:
     if not isinstance(sources, Mapping):
         sources = {"photos": sources}
+        if isinstance(sources["photos"], Sequence) and any(isinstance(source, ImageSource) for source in sources["photos"]):
+            raise TypeError('a list holds urls, and several ImageSource are named: {"indoor": ImageSource(...), "street": ...}')
     if not sources:
         raise ValueError("sources is empty; name at least one tar of photos")
     if not all(isinstance(name, str) for name in sources):

@@ -133,7 +133,7 @@ def write_index(urls: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
         if listing is None:
             listing, unchanged = list_shard(url, checksums=True), False
             stamp = dict(listing.stamp)
-            if _stamp(url) != stamp:
+            if shard_stamp(url) != stamp:
                 raise OSError(f"{shown_url(url)} changed while it was indexed; run this again when nothing writes to it")
             report.files.append(_store(url, _to_json(url, stamp, listing)))
         report.shards += 1
@@ -169,7 +169,7 @@ def load_listing(url: str, *, even_if_touched: bool = False) -> Listing | None:
             stamp, listing = _from_json(url, text)
         except (ValueError, RecursionError) as error:
             raise StaleIndex(f"{path} is no index of version {VERSION}, or damaged ({error})") from error
-        now = _stamp(url)
+        now = shard_stamp(url)
         if now != stamp and not (even_if_touched and now["size"] == stamp["size"]):
             raise StaleIndex(f"{path} is older than its shard")
         listing.stamp = now
@@ -215,7 +215,7 @@ def _places(url: str) -> list[str]:
     return [*([] if path is None else [f"{path}{INDEX_ENDING}"]), os.path.join(cache, "index", cached)]
 
 
-def _stamp(url: str) -> dict[str, Any]:
+def shard_stamp(url: str) -> dict[str, Any]:
     """What changes with the shard: its size, and its time or the server's tag."""
     path = local_path(url)
     if path is not None:

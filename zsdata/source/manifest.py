@@ -18,7 +18,7 @@ import numpy as np
 from zsdata.faults import BadPhoto
 from zsdata.progress import Progress
 from zsdata.source.archive import Problem, header_inside
-from zsdata.source.index import CHANGED_BYTES, CHANGED_DEPTH, CHECKSUM_UNKNOWN, NO_DEPTH, load_or_list
+from zsdata.source.index import CHANGED_BYTES, CHANGED_DEPTH, CHECKSUM_UNKNOWN, NO_DEPTH, load_or_list, shard_stamp
 from zsdata.source.ranges import ShardFile, read_range
 from zsdata.source.retry import Stamp
 from zsdata.source.shard_cache import ShardCache
@@ -68,6 +68,16 @@ class Manifest:
     def depth_maps(self) -> int:
         """How many of the photos have a depth map."""
         return 0 if self.depth_offsets is None else int(np.count_nonzero(self.depth_offsets != NO_DEPTH))
+
+    def is_current(self, urls: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) -> bool:
+        """Whether `urls` still name the shards that were listed, and none of the local ones has changed. Servers are not asked.
+
+        Raises:
+            FileNotFoundError and others: as `expand_urls` raises them.
+        """
+        return tuple(expand_urls(urls)) == self.shard_urls and all(
+            local_path(url) is None or shard_stamp(url) == stamp for url, stamp in zip(self.shard_urls, self.stamps or (), strict=True)
+        )
 
     def member(self, index: int) -> Member:
         """Photo `index`, 0 <= index < len(self)."""
