@@ -1,5 +1,7 @@
 """Every shard walked, every photo decoded."""
 
+import os
+
 import pytest
 
 from zsdata.faults import BadPhoto
@@ -92,3 +94,15 @@ def test_the_progress_bar_is_on_stderr_when_asked_for(tmp_path, capsys):
     assert not out and "verifying" in err and "shard 2 of 2: 1.tar" in err
     verify(shards, progress=False)
     assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.timeout(30)
+@pytest.mark.parametrize(("make", "says"), [(os.mkdir, "it is a folder"), (os.mkfifo, "it is no regular file")])
+def test_what_only_has_the_name_of_a_shard_is_named_and_not_waited_for(tmp_path, make, says):
+    photo_tar(tmp_path / "a.tar", count=1)
+    make(tmp_path / "b.tar")
+    assert verify(tmp_path).problems == [
+        Problem(str(tmp_path / "b.tar"), None, 0, f"cannot be read: {says}; a shard is an uncompressed tar")
+    ]
+    with pytest.raises(OSError, match=f"{says}.*b.tar"):
+        build_manifest(tmp_path)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 from types import TracebackType
 
 from zsdata.faults import BadShard
@@ -45,8 +47,13 @@ class ShardFile:
         path = local_path(url)
         self._remote = path is None
         if path is not None:
-            self._descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            self._descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # a pipe would wait for its writer
             self.stamp = _local_stamp(self._descriptor)
+            mode = os.fstat(self._descriptor).st_mode
+            if not stat.S_ISREG(mode):
+                self.close()
+                what = "it is a folder" if stat.S_ISDIR(mode) else "it is no regular file"
+                raise OSError(errno.EINVAL, f"{what}; a shard is an uncompressed tar", path)
         else:
             look_anew(url)
             self._window, self.stamp = _read_remote(url, 0, FIRST_BYTES, None)
