@@ -29,6 +29,7 @@ from zsdata.exported import (
 from zsdata.loader import StereoLoader
 from zsdata.progress import Progress
 from zsdata.sample import StereoBatch
+from zsdata.source.writing import writing
 from zsdata.stream import ZeroStereoStream
 
 RECORD = "export.json"  # what the export was made with
@@ -102,7 +103,8 @@ def write_whole(path: Path, content: bytes) -> None:
     """A file under its name has all of its content, or is not there."""
     partial = path.with_name(path.name + ".partial")
     try:
-        partial.write_bytes(content)
+        with writing(path):
+            partial.write_bytes(content)
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)

@@ -17,6 +17,7 @@ from zsdata.progress import Progress
 from zsdata.source.ranges import ShardFile
 from zsdata.source.retry import UnreachableShard
 from zsdata.source.urls import base_name, expand_urls
+from zsdata.source.writing import writing
 
 MAX_RATIO = 100  # of the plain to the compressed size; photos hardly compress, a bomb of gzip has 1,000, one of zstd 30,000
 SMALL_BYTES = 1 << 26  # 64 MiB that any file may become
@@ -90,7 +91,9 @@ def _decompress_one(url: str, target: Path) -> None:
                 while chunk := stream.read(CHUNK_BYTES):
                     if plain.tell() + len(chunk) > limit:
                         raise BadShard(f"a bomb: grows to more than {MAX_RATIO} times its size", file.url, 0)
-                    plain.write(chunk)
+                    with writing(target):
+                        plain.write(chunk)
+                        plain.flush()
         except EOFError as error:
             raise BadShard("ends inside the compressed data; download it again", file.url, file.size) from error
         except (zlib.error, OSError) as error:

@@ -6,6 +6,7 @@ import os
 import re
 import tarfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -16,6 +17,7 @@ from zsdata.source.archive import DEPTH_EXTENSIONS, MAX_PHOTO_BYTES, OTHER_IMAGE
 from zsdata.source.depth_map import DepthMap, decode_depth
 from zsdata.source.index import INDEX_ENDING
 from zsdata.source.photo import probe_photo, usable_photo
+from zsdata.source.writing import writing
 
 _BLOCK = 512
 _DEPTH_FILE = re.compile(rf"(.+)\.({'|'.join(map(re.escape, DEPTH_EXTENSIONS))})", re.IGNORECASE | re.DOTALL)
@@ -148,10 +150,11 @@ class _Shards:
             path.unlink(missing_ok=True)  # left by a run that was killed
             self._file = open(path, "xb")
             self._partial.append(path)
-        for name, data in members.items():
-            self._file.write(_header(name, len(data)))
-            self._file.write(data)
-            self._file.write(bytes(-len(data) % _BLOCK))
+        with writing(self._partial[-1]):
+            for name, data in members.items():
+                self._file.write(_header(name, len(data)))
+                self._file.write(data)
+                self._file.write(bytes(-len(data) % _BLOCK))
         self._photos += 1
         if self._photos % self._photos_per_shard == 0:
             self._finish()
@@ -170,8 +173,9 @@ class _Shards:
 
     def _finish(self) -> None:
         if self._file is not None:
-            self._file.write(_END_OF_ARCHIVE)
-            self._file.close()
+            with writing(self._partial[-1]):
+                self._file.write(_END_OF_ARCHIVE)
+                self._file.close()
             self._file = None
 
     def __enter__(self) -> _Shards:
@@ -179,7 +183,8 @@ class _Shards:
 
     def __exit__(self, *raised: object) -> None:
         if self._file is not None:
-            self._file.close()
+            with suppress(OSError):  # what is still to be written, to a full disk
+                self._file.close()
         for path in self._partial:
             path.unlink(missing_ok=True)
 
