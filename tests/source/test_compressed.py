@@ -136,3 +136,11 @@ def test_files_behind_http_are_read_without_other_packages(tmp_path, monkeypatch
             decompress(plain, tmp_path / "out")
         http_ranges.close_connections()
     assert files(tmp_path / "out") == ["a.tar"]
+
+
+def test_what_a_killed_run_left_stops_no_other(tmp_path):
+    """In a container all runs have one process number."""
+    (tmp_path / "a.tar.gz").write_bytes(gzip.compress(PLAIN))
+    (tmp_path / f"a.tar.{os.getpid()}.partial").write_bytes(PLAIN[:700])
+    (path,) = decompress(tmp_path / "a.tar.gz", tmp_path)
+    assert len(list(read_shard(path))) == 5

@@ -67,7 +67,7 @@ def decompress(
     for url, target in zip(
         Progress(sources, desc="decompressing", unit="shard", disable=None if progress is None else not progress), targets, strict=True
     ):
-        partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
+        partial = target.with_name(f"{target.name}.{os.urandom(8).hex()}.partial")  # process numbers come again in containers
         try:
             _decompress_one(url, partial)
             os.replace(partial, target)
