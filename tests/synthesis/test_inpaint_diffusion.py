@@ -303,11 +303,14 @@ def test_half_precision_stays_close(folder, inpainter):
     assert 0 < (made - inpainter(right, inpaint_mask, generators(0))).abs().mean() < 10
 
 
-def test_an_autocast_around_it_changes_nothing(inpainter):
+def test_an_autocast_around_it_changes_nothing(folder, inpainter):
     right, inpaint_mask = scenes(1)
     with torch.autocast("cpu", torch.bfloat16):
         made = inpainter(right, inpaint_mask, generators(0))
-    assert torch.equal(made, inpainter(right, inpaint_mask, generators(0)))
+        loaded_there = load_inpainter(folder, steps=inpainter.steps)  # as a stream does at its first pair
+    expected = inpainter(right, inpaint_mask, generators(0))
+    assert torch.equal(made, expected)
+    assert torch.equal(loaded_there(right, inpaint_mask, generators(0)), expected)
 
 
 @pytest.mark.filterwarnings("ignore:.*script_method.*:DeprecationWarning")  # PyTorch's own compiler

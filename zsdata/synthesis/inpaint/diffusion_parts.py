@@ -140,7 +140,7 @@ def load_diffusion_parts(network: DiffusionNetwork, dtype: torch.dtype = torch.f
             f"text encoder knows {text_encoder.config.vocab_size}, and the prompt must be begin and end. Its vocabulary (tokenizer.json, "
             "or vocab.json and merges.txt) is missing, or belongs to another pipeline: download it again"
         )
-    with torch.no_grad():
+    with torch.no_grad(), torch.autocast("cpu", enabled=False):  # an autocast around the first use must not change the pictures
         prompt = text_encoder.float()(words)[0]
     if prompt.shape[-1] != unet.config.cross_attention_dim:
         raise ValueError(
