@@ -197,6 +197,13 @@ def test_sensor_noise_of_the_two_cameras_is_independent():
     assert (left * right).mean().abs() < 5 * 9 / math.sqrt(left.numel())
 
 
+def test_the_right_image_has_both_noises_whose_variances_add_up():
+    grey = torch.full((1, 3, 128, 128), 128.0)
+    both = replace(NONE, sensor_noise_probability=1.0, sensor_noise_std=(3.0, 3.0), noise_probability=1.0, noise_std=(4.0, 4.0))
+    left, right = ((image - grey).double().std().item() for image in run(grey, grey, both))
+    assert abs(left - 3) < 0.1 and abs(right - 5) < 0.15
+
+
 def test_gains_and_optical_centres_differ_between_the_cameras():
     grey = torch.full((1, 3, 64, 80), 100.0)
     left, right = run(grey, grey, replace(NONE, gain_probability=1.0))

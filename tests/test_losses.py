@@ -172,11 +172,12 @@ def test_metrics_are_of_the_last_prediction_over_valid_pixels():
     last = torch.full(shape, 5.0)
     last[..., 0] += 2  # an eighth of the picture, a quarter of what is valid
     last[..., 1] -= 4
+    last[..., 2] += 1  # not bad: "bad-1" is off by more than 1 px
     last[..., 4:] = 100.0
     images = torch.zeros(1, 3, 8, 8)
     masks = Masks(valid, ~valid, valid)
     _, metrics = zero_stereo_loss([last + 50, last], images, images, disparity, torch.ones(shape), masks)
-    assert metrics["epe"].item() == pytest.approx(1.5)
+    assert metrics["epe"].item() == pytest.approx(1.75)
     assert metrics["bad_1"].item() == pytest.approx(0.5) and metrics["bad_3"].item() == pytest.approx(0.25)
     assert not any(value.requires_grad for value in metrics.values())
 

@@ -64,6 +64,26 @@ def test_a_source_shows_all_its_photos_before_it_repeats_one(plan):
             assert max(often) - min(often) <= 1
 
 
+def photos_of(plan, epoch, source):
+    choices = [plan.choose(epoch, i) for i in range(plan.epoch_size)]
+    return {choice.member for choice in choices if choice.source == source}
+
+
+def test_a_source_gives_an_epoch_the_same_photos_whatever_stands_beside_it():
+    alone = EpochPlan(3, ("street",), (40,), (10,))
+    beside = EpochPlan(3, ("indoor", "street"), (7, 40), (12, 10))
+    assert all(photos_of(alone, epoch, 0) == photos_of(beside, epoch, 1) for epoch in range(8))
+
+
+def test_seed_epoch_source_and_pass_each_have_an_order_of_their_own():
+    plan, other_seed = (EpochPlan(seed, ("a", "b"), (40, 40), (10, 10)) for seed in (0, 1))
+    mixtures = [[of.choose(epoch, i).source for i in range(20)] for of, epoch in ((plan, 0), (plan, 1), (other_seed, 0))]
+    assert mixtures[0] != mixtures[1] and mixtures[0] != mixtures[2]
+    assert photos_of(plan, 0, 0) != photos_of(other_seed, 0, 0)
+    assert photos_of(plan, 0, 0) != photos_of(plan, 0, 1)
+    assert photos_of(plan, 0, 0) != photos_of(plan, 4, 0)  # after all 40 photos were shown once
+
+
 @given(st.lists(st.integers(1, 40), min_size=1, max_size=4), st.integers(0, 9))
 def test_without_an_epoch_size_an_epoch_is_one_exact_pass(sizes, epoch):
     plan = EpochPlan(0, tuple(map(str, range(len(sizes)))), tuple(sizes), quotas_for(sizes, [None] * len(sizes), None))
@@ -81,6 +101,17 @@ def test_spares_are_all_other_photos_of_the_source_once(plan, epoch):
         attempt += 1
     assert sorted(s.member for s in spares) == sorted(set(range(plan.sizes[chosen.source])) - {chosen.member})
     assert all(s.source == chosen.source for s in spares)
+
+
+def test_spares_are_spread_over_the_source():
+    plan = EpochPlan(0, ("a",), (1000,), (1000,))
+    spares = [plan.spare(0, i, 0) for i in range(30)]
+    assert len({spare.member for spare in spares if spare is not None}) > 25  # and no photo stands in for every bad one
+
+
+def test_quotas_are_rounded_by_largest_remainder():
+    assert quotas_for([9, 9, 9], [0.59, 0.29, 0.12], 10) == (6, 3, 1)
+    assert quotas_for([9, 9], [None, None], 3) == (2, 1)  # of equal ones the first
 
 
 @given(st.lists(st.integers(1, 1000), min_size=1, max_size=5), st.integers(1, 10_000), st.data())

@@ -55,6 +55,12 @@ def test_an_edited_field_is_refused_by_name_or_is_a_place(name, value):
             from_state(state)
 
 
+def test_the_end_of_an_epoch_is_a_place_and_one_sample_further_is_none():
+    assert from_state({**STATE, "samples": EPOCH}).samples == EPOCH
+    with pytest.raises(ValueError, match="samples is 1001, but epoch 3 has only 1000"):
+        from_state({**STATE, "samples": EPOCH + 1})
+
+
 @given(st.sampled_from(sorted(STATE)), st.text(min_size=1).filter(lambda name: name not in STATE))
 def test_missing_and_unknown_fields_are_named(missing, unknown):
     with pytest.raises(ValueError, match=rf"missing \['{missing}'\]"):

@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from zsdata.synthesis.confidence import flip_confidence, flip_consistency, normalize_inverse_depth
+from zsdata.synthesis.depth.maps import depth_maps
 
 
 def test_each_map_is_brought_to_its_own_range():
@@ -35,3 +36,11 @@ def test_full_agreement_is_full_confidence():
     first = torch.rand(1, 1, 4, 4)
     assert torch.equal(flip_confidence(first, first), torch.ones_like(first))
     assert flip_consistency(first, first).item() == 1
+
+
+def test_depth_is_kept_as_the_nearest_whole_numbers():
+    estimate, mirrored = torch.rand(1, 1, 20, 30), torch.rand(1, 1, 20, 30)
+    kept = depth_maps(estimate, mirrored)
+    exact = normalize_inverse_depth(estimate), flip_confidence(normalize_inverse_depth(estimate), normalize_inverse_depth(mirrored))
+    for values, expected, steps in zip(kept[:2], exact, (65_535, 255), strict=True):
+        assert (values.double() - expected.double() * steps).abs().max() < 0.51

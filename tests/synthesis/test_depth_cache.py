@@ -398,6 +398,17 @@ def test_a_process_that_never_lets_go_of_the_lock_stops_nobody(cache, monkeypatc
     assert "another process has held" in warnings_said()[0]
 
 
+def test_the_lock_does_not_stay_with_a_process_that_is_forked_meanwhile(cache, monkeypatch):
+    monkeypatch.setattr("zsdata.folder_ledger.LOCK_SECONDS", 0.1)
+    with open_ledger(cache.folder, "depth") as ledger:
+        of_the_child = os.dup(ledger._descriptor)  # what it has of the ledger's file, for as long as it lives
+    try:
+        with open_ledger(cache.folder, "depth"):
+            pass
+    finally:
+        os.close(of_the_child)
+
+
 def test_an_interrupted_store_leaves_nothing_behind(cache, monkeypatch):
     held = held_bytes(cache.folder)
 

@@ -19,6 +19,14 @@ def test_adaptive_scales_follow_the_papers_mixture():
     assert np.mean(scales[(scales > 0.05) & (scales < 0.15)]) == pytest.approx(0.1, abs=0.001)
 
 
+def test_each_range_of_adaptive_scales_has_a_probability_of_its_own():
+    generator = np.random.default_rng(0)
+    mixture = AdaptiveDisparity(center_probability=0.5, small_probability=0.4, large_probability=0.1)
+    scales = np.array([mixture.draw_scale(generator, 640) for _ in range(5000)])
+    assert np.mean(scales < 0.05) == pytest.approx(0.4, abs=0.03)
+    assert np.mean(scales > 0.15) == pytest.approx(0.1, abs=0.03)
+
+
 def test_uniform_scales_are_pixels_whatever_the_width():
     for width in (100, 2000):
         pixels = [UniformDisparity(min_px=20, max_px=30).draw_scale(np.random.default_rng(i), width) * width for i in range(200)]

@@ -60,6 +60,39 @@ def test_a_photo_of_many_pixels_shows_as_much_as_one_of_two_crops_width(crop):
         ViewConfig(max_width=0.5)
 
 
+def test_windows_lie_anywhere_and_each_draw_is_its_own():
+    still = ViewConfig(min_scale=0, max_scale=0, max_stretch=0)
+    windows = np.array([draw_view((101, 151), (50, 60), np.random.default_rng(i), still, 0.0).window for i in range(600)])
+    assert windows[:, :2].min(0).tolist() == [0, 0]
+    assert (windows[:, 0] + windows[:, 2]).max() == 101 and (windows[:, 1] + windows[:, 3]).max() == 151
+    assert abs(np.corrcoef(windows[:, 0], windows[:, 1])[0, 1]) < 0.15
+
+
+def test_views_are_mirrored_and_stretched_as_often_as_asked():
+    config = ViewConfig(min_scale=0.5, max_scale=0.5, max_stretch=1, stretch_probability=0.2, mirror_probability=0.9)
+    generator = np.random.default_rng(0)
+    views = [draw_view((401, 601), (50, 60), generator, config, 0.1) for _ in range(2000)]
+    stretched = [not 0.96 < view.scale_x * view.window[2] / view.height < 1.04 for view in views]  # some by next to nothing
+    assert np.mean(stretched) == pytest.approx(0.19, abs=0.03)
+    assert np.mean([view.mirror for view in views]) == pytest.approx(0.9, abs=0.03)
+
+
+@pytest.mark.parametrize("size", [(60, 300), (300, 60), (40, 50)])
+def test_a_photo_smaller_than_the_crop_is_enlarged_and_keeps_its_aspect(size):
+    for seed in range(20):
+        view = draw_view(size, (96, 128), np.random.default_rng(seed), ViewConfig(max_stretch=0), 0.1)
+        assert view.scale_x == pytest.approx(view.height / view.window[2], rel=0.05)
+
+
+@pytest.mark.parametrize("size", [(768, 1024), (480, 640), (3072, 4096)])
+def test_the_margin_reaches_as_far_as_the_largest_disparity_or_the_photo_goes(size):
+    for seed in range(50):
+        view = draw_view(size, (96, 128), np.random.default_rng(seed), ViewConfig(), 0.1)
+        largest_px = 0.1 * size[1] * view.scale_x
+        room_px = (size[1] - view.window[1]) * view.scale_x - (view.width - view.margin)
+        assert view.margin >= min(largest_px, room_px) - 1
+
+
 @pytest.mark.parametrize("orientation", [1, 3, 6])
 @pytest.mark.parametrize("reduction", [2, 4])
 def test_a_view_of_a_jpeg_decoded_at_a_fraction_is_the_view_of_the_whole_one(orientation, reduction):
@@ -82,8 +115,15 @@ def test_photo_and_map_show_the_same_place(mirror):
     shown = view_map(torch.from_numpy(ramp)[None, None], view)[0, 0].numpy()
     expected = cv2.resize(ramp[10:70, 50:130] if mirror else ramp[10:70, 20:100], (100, 45), interpolation=cv2.INTER_LINEAR)
     assert np.allclose(shown, expected[:, ::-1] if mirror else expected, atol=1e-3)
+    assert np.abs(view_photo(np.repeat(ramp.round().astype(np.uint8)[..., None], 3, 2), view)[..., 1] - shown).max() < 1.5
     rows = ramp[8:75]
     assert np.array_equal(view_map(torch.from_numpy(rows)[None, None], view, first_row=8)[0, 0].numpy(), shown)
+
+
+def test_a_photo_that_shrinks_to_less_than_half_of_its_pixels_is_averaged():
+    checked = np.where(np.add.outer(np.arange(120), np.arange(160)) % 2, 255, 0).astype(np.uint8)
+    shown = view_photo(np.repeat(checked[..., None], 3, 2), View(False, (0, 0, 120, 160), 40, 52, 0))
+    assert np.abs(shown.astype(float) - 127.5).max() < 30  # finer than a pixel of the view: grey, and no pattern
 
 
 def test_a_whole_view_changes_nothing():

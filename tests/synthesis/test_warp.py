@@ -1,3 +1,5 @@
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import torch
@@ -161,6 +163,21 @@ def test_an_image_is_the_same_in_whatever_parts_it_is_warped(values, monkeypatch
         monkeypatch.setattr(warp_file, name, pixels)
         for a, b in zip(forward_warp(left, disparity), whole, strict=True):
             assert torch.equal(a, b)
+
+
+def test_threads_may_warp_at_once():
+    generator = torch.Generator().manual_seed(5)
+    lefts = torch.rand((4, 1, 3, 120, 160), generator=generator)
+    disparities = torch.rand((4, 1, 1, 120, 160), generator=generator) * 20
+    expected = [forward_warp(*pair) for pair in zip(lefts, disparities, strict=True)]
+    with ThreadPoolExecutor(4) as threads:
+        for _ in range(20):
+            made = threads.map(forward_warp, lefts, disparities)
+            assert all(
+                torch.equal(ours, theirs)
+                for one, other in zip(made, expected, strict=True)
+                for ours, theirs in zip(one, other, strict=True)
+            )
 
 
 def test_a_value_that_is_no_number_covers_nothing():
