@@ -424,6 +424,37 @@ def test_a_name_is_safe_whatever_the_key_is(parts, epoch, index):
     assert len(exported.file_list_line(name).split(" ")) == 6
 
 
+def test_the_name_of_a_long_key_ends_as_the_key_does():
+    meta = {"source": "photos", "shard": "a.tar", "epoch": 0, "index": 0}
+    folder = "a-folder-of-a-long-name/" * 10
+    names = [pair_name({**meta, "key": f"{folder}{number:06d}"}) for number in range(2)]
+    assert [name[-7:] for name in names] == ["_000000", "_000001"]
+
+
+def test_colours_between_two_levels_are_rounded(stream):
+    pair = next(iter(stream))
+    colours = pair.right_clean.round().clamp(1, 254)
+    files = exported.encode_pair(replace(pair, right_clean=colours - 0.4))
+    (png,) = [content for path, content in files.items() if path.startswith("right/")]
+    assert np.array_equal(np.asarray(Image.open(io.BytesIO(png))), colours.permute(1, 2, 0).byte().numpy())
+
+
+def test_settings_that_a_later_run_does_not_name_are_refused(stream, tmp_path):
+    export_pairs(stream, tmp_path / "pairs", pairs=1, settings={"size": [64, 96]})
+    with pytest.raises(ValueError, match=r"size was \[64, 96\] and is null"):
+        export_pairs(stream, tmp_path / "pairs", pairs=1)
+
+
+def test_a_file_that_cannot_be_finished_leaves_nothing_behind(tmp_path, monkeypatch):
+    def fails(*paths):
+        raise OSError("out of luck")
+
+    monkeypatch.setattr("os.replace", fails)
+    with pytest.raises(OSError, match="out of luck"):
+        export.write_whole(tmp_path / "a.png", b"content")
+    assert not any(tmp_path.iterdir())
+
+
 def test_a_key_that_is_a_path_out_of_the_folder_stays_inside(tmp_path):
     shard = write_tar(tmp_path / "a b.tar", {"../../ev il\n'$x.jpg": jpeg(photo(0))})
     stream = stream_of(shard)

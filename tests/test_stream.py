@@ -14,6 +14,7 @@ from tests.scenes import grey_fill, jpeg, layered_depth, photo, photo_tar, png, 
 from zsdata import AdaptiveDisparity, AugmentConfig, ImageSource, StereoBatch, UniformDisparity, ZeroStereoStream
 from zsdata.quality import QualityGate
 from zsdata.seeding import rng
+from zsdata.synthesis.synthesizer import SynthesisConfig
 from zsdata.synthesis.view import ViewConfig
 
 SIZE = (64, 96)
@@ -336,7 +337,13 @@ def test_a_depth_estimator_that_fails_names_the_sample(tar):
     [
         ({"seed": 5}, "seed"),
         ({"size": (64, 64)}, "configuration"),
+        ({"depth": grey_fill}, "configuration"),
+        ({"inpaint": "builtin"}, "configuration"),
         ({"disparity": AdaptiveDisparity(center=0.2)}, "configuration"),
+        ({"view": ViewConfig(max_width=3)}, "configuration"),
+        ({"synthesis": SynthesisConfig(dilate_px=2)}, "configuration"),
+        ({"quality": QualityGate(max_hole_share=0.4)}, "configuration"),
+        ({"augmentation": AugmentConfig.none()}, "configuration"),
         ({"epoch_size": 5}, "manifest"),
     ],
 )
@@ -344,6 +351,39 @@ def test_a_state_of_another_stream_is_refused_by_field(tar, change, message):
     state = open_stream(tar).state_dict()
     with pytest.raises(ValueError, match=f"the state's {message} is"):
         open_stream(tar, **change).load_state_dict(state)
+
+
+def test_views_of_a_photo_and_uses_of_a_pair_are_not_the_same(tar):
+    views, uses = open_stream(tar, views_per_image=2, epoch_size=8), open_stream(tar, reuse=2, epoch_size=8)
+    with pytest.raises(ValueError, match="the state's configuration is"):
+        uses.load_state_dict(views.state_dict())
+
+
+def test_a_state_of_other_names_quotas_or_swaps_is_refused(tar):
+    def state(sources, **options):
+        return open_stream(sources, **{"epoch_size": 6, **options}).state_dict()
+
+    there = state({0: {"indoor": tar}, 5: tar})
+    assert there == state({0: {"indoor": tar}, 5: tar})
+    others = [
+        state({0: {"outdoor": tar}, 5: tar}),
+        state({0: {"indoor": tar}, 6: tar}),
+        state({0: {"indoor": tar}}),
+        state({0: {"indoor": tar}, 5: tar}, epoch_size=7),
+    ]
+    assert len({other["manifest"] for other in [there, *others]}) == 5
+    seven, eight = (state(tar, views_per_image=2, epoch_size=size) for size in (7, 8))  # of as many photos
+    assert seven["manifest"] != eight["manifest"]
+
+
+def test_sources_that_are_swapped_twice_are_the_last_ones(tar, tmp_path):
+    second, third = photo_tar(tmp_path / "b.tar", 4, first_seed=50), photo_tar(tmp_path / "c.tar", 5, first_seed=70)
+    twice, once = open_stream(tar), open_stream(tar)
+    twice.set_sources(second, epoch=2)
+    for stream in (twice, once):
+        stream.set_sources(third, epoch=2)
+    assert [twice.epoch_size(epoch) for epoch in (1, 2, 9)] == [len(once), 5, 5]
+    twice.load_state_dict(once.state_dict())
 
 
 @pytest.mark.parametrize("state", [None, {}, {"version": 1}, {"epoch": 1, "extra": 2}])
@@ -487,6 +527,24 @@ def test_the_depth_cache_changes_no_byte_and_saves_the_estimates(tar, tmp_path, 
         depth = CountingDepth()
         assert by_index(open_stream(tar, depth=depth, depth_cache=tmp_path / "depth", **options)) == without
         assert depth.calls == (0 if epoch_is_cached else 24)
+
+
+class NearerOnTheLeft:
+    cache_name = "lopsided v1"
+
+    def __call__(self, images):
+        return layered_depth(images) * torch.linspace(1.0, 0.8, images.shape[-1])
+
+
+def test_depth_with_and_without_confidence_lie_apart_in_a_depth_cache(tar, tmp_path):
+    def confidence(flip, **options):
+        stream = open_stream(tar, depth=NearerOnTheLeft(), synthesis=SynthesisConfig(flip_confidence=flip), **options)
+        return next(iter(stream)).confidence
+
+    without_cache = confidence(True)
+    assert without_cache.min() < 0.5
+    for flip in (False, True, False):
+        assert torch.equal(confidence(flip, depth_cache=tmp_path / "depth"), without_cache if flip else torch.ones_like(without_cache))
 
 
 def test_workers_share_the_depth_cache(tar, plain, tmp_path):

@@ -53,6 +53,15 @@ def test_every_hole_is_filled_and_known_pixels_stay_bit_for_bit(seed, height, wi
     assert torch.equal(filled.masked_fill(inpaint_mask, 0), right)
 
 
+def test_what_stands_in_the_holes_does_not_matter():
+    right, holes, other = torch.rand(2, 3, 20, 24) * 255, torch.rand(2, 1, 20, 24) < 0.3, torch.rand(2, 3, 20, 24) * 255
+    emptied = right.masked_fill(holes, 0)
+    for background in (other, None):
+        assert torch.equal(
+            RandomBackground()(right, holes, background=background), RandomBackground()(emptied, holes, background=background)
+        )
+
+
 def test_without_a_known_pixel_the_other_photo_is_shown_as_it_is():
     other = image(3)
     filled = inpaint(torch.zeros_like(other), torch.ones(1, 1, 60, 90, dtype=torch.bool), None, other)

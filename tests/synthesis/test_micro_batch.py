@@ -51,6 +51,27 @@ def test_what_does_not_fit_is_halved_for_the_rest_of_the_run_and_said_once(caplo
     assert "with 8 samples at once; from now on it takes 4" in caplog.text and "set micro_batch=2" in caplog.text
 
 
+def test_what_did_not_fit_once_is_not_chosen_again():
+    batch = MicroBatch("network", 8, GPU, "cure")
+    batch.run(limited(4, []), 8)
+    for asked, used in ((16, 4), (2, 2), (8, 4)):
+        batch.choose(asked)
+        assert batch.size == used
+
+
+def test_work_in_which_memory_ran_out_is_measured_once_more():
+    batch, runs = MicroBatch("network", 8, GPU, "cure"), []
+
+    def work():
+        runs.append(batch.size)
+        batch.run(limited(4, []), 8)
+
+    batch.measure(work)
+    assert runs == [8, 4]
+    batch.measure(work)
+    assert runs == [8, 4, 4]
+
+
 def test_the_last_smaller_part_is_halved_by_its_own_size():
     batch = MicroBatch("network", 8, GPU, "cure")
     batch.run(limited(1, []), 3)
