@@ -234,3 +234,18 @@ def test_the_progress_bar_is_on_stderr_when_asked_for(tmp_path, capsys):
     write_index(photo_tar(tmp_path / "a.tar", count=1), progress=True)
     out, err = capsys.readouterr()
     assert not out and "indexing" in err
+
+
+def test_an_index_that_cannot_be_finished_leaves_the_old_one_and_nothing_beside_it(tmp_path, monkeypatch):
+    tar = photo_tar(tmp_path / "a.tar", 2)
+    write_index(tar)
+    photo_tar(tmp_path / "a.tar", 3)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def fails(*paths):
+        raise OSError("out of luck")
+
+    monkeypatch.setattr("os.replace", fails)
+    with pytest.raises(OSError, match="out of luck"):
+        write_index(tar)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
