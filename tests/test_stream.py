@@ -288,6 +288,13 @@ def test_the_uniform_baseline_draws_pixels(tar):
     assert all(10 <= pair.meta["disparity_scale"] * 160 <= 12 for pair in pairs)
 
 
+def test_the_uniform_baseline_draws_pixels_of_what_a_large_photo_is_taken_for(tmp_path):
+    """Not of its file: in the crop the same range would be a fraction of that of other photos."""
+    large = photo_tar(tmp_path / "large.tar", 4, height=512, width=768)  # eight crops wide, and taken for two
+    pairs = list(open_stream(large, disparity=UniformDisparity(min_px=10, max_px=12)))
+    assert len(pairs) == 4 and all(10 <= pair.meta["disparity_scale"] * 192 <= 12 for pair in pairs)
+
+
 def test_the_label_reprojects_the_right_image_onto_the_left(tar):
     from zsdata import backward_warp
 

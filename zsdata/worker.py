@@ -174,7 +174,8 @@ class Worker:
             return rng(recipe.seed, meta["epoch"], meta["pair"], purpose + spare)
 
         photo = self._open(sources, choice, meter)
-        scale = recipe.disparity.draw_scale(draw("disparity"), photo.size[1])
+        width = photo.size[1] if recipe.size is None else recipe.view.taken_width(photo.size[1], recipe.size[1])
+        scale = recipe.disparity.draw_scale(draw("disparity"), width)
         if recipe.size is None:
             view = whole_view(photo.size)
         else:

@@ -48,7 +48,7 @@ class AdaptiveDisparity:
         if min(probabilities) < 0 or abs(sum(probabilities) - 1) > 1e-6:
             raise ValueError(f"center_probability, small_probability, large_probability are 0 or more and add up to 1; got {probabilities}")
 
-    def draw_scale(self, generator: np.random.Generator, width: int) -> float:
+    def draw_scale(self, generator: np.random.Generator, width: float) -> float:
         """The disparity of the nearest point as a share of `width`; in (c - 2 r, c + 2 r)."""
         del width
         which, where = generator.random(2)
@@ -64,7 +64,10 @@ class AdaptiveDisparity:
 
 @dataclass(frozen=True, kw_only=True)
 class UniformDisparity:
-    """MfS-Stereo's choice, the paper's baseline: the largest disparity is uniform in a range of pixels, whatever the photo's width."""
+    """MfS-Stereo's choice, the paper's baseline: the largest disparity is uniform in a range of pixels, whatever the photo's width.
+
+    Of a photo that the stream takes for a smaller one they are that one's pixels (see `ViewConfig.max_width`).
+    """
 
     min_px: float = 50.0
     max_px: float = 225.0
@@ -74,7 +77,7 @@ class UniformDisparity:
         if not 0 < self.min_px <= self.max_px:
             raise ValueError(f"a range of pixels needs 0 < min_px <= max_px; got {self.min_px}..{self.max_px}")
 
-    def draw_scale(self, generator: np.random.Generator, width: int) -> float:
+    def draw_scale(self, generator: np.random.Generator, width: float) -> float:
         """The disparity of the nearest point as a share of `width`."""
         return float(generator.uniform(self.min_px, self.max_px)) / width
 

@@ -43,6 +43,10 @@ class ViewConfig:
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is in 0..1; got {getattr(self, name)}")
 
+    def taken_width(self, photo_width: int, crop_width: int) -> float:
+        """Pixels across of what a photo is taken for; see `max_width`."""
+        return min(photo_width, self.max_width * crop_width)
+
 
 REDUCTIONS = (8, 4, 2)  # by which a JPEG can be decoded at a fraction of its size, for a fraction of the time
 
@@ -88,7 +92,7 @@ def draw_view(
     stretched = draws[1] < config.stretch_probability
     stretch_x, stretch_y = (config.max_stretch * (2 * draw - 1) if stretched else 0.0 for draw in draws[2:4])
 
-    scale = min(1.0, config.max_width * width / photo_width) * 2**exponent
+    scale = config.taken_width(photo_width, width) / photo_width * 2**exponent
     scale = max(scale, height / photo_height, width / photo_width)  # one scale for both sides: a small photo keeps its aspect
     window_width = min(photo_width, max(1, round(width / (scale * 2**stretch_x))))
     window_height = min(photo_height, max(1, round(height / (scale * 2**stretch_y))))
