@@ -21,6 +21,7 @@ from zsdata.seeding import rng
 from zsdata.source.manifest import build_manifest
 from zsdata.source.photo import decode_rgb
 from zsdata.synthesis.disparity import AdaptiveDisparity
+from zsdata.synthesis.view import ViewConfig
 from zsdata.synthesis.warp import forward_warp
 
 
@@ -214,6 +215,19 @@ def wide_photo_example(size, draw):
     return from_photo(image, torch.from_numpy(near)[None, None], AdaptiveDisparity(), size, draw)
 
 
+def test_holes_of_a_large_photo_are_no_wider_than_the_stream_makes_them():
+    """The stream takes a photo of eight crops' width for one of two."""
+    image = photo(0, 512, 768)
+    bars = torch.zeros(1, 1, 512, 768)
+    bars[..., 192:384] = bars[..., 576:] = 1
+    widest = 0
+    for index in range(12):
+        mask = from_photo(image, bars, AdaptiveDisparity(), (64, 96), lambda purpose, index=index: rng(0, 0, index, purpose)).inpaint_mask
+        edges = torch.nn.functional.pad(mask[0, 0].int(), (1, 1)).diff().nonzero()[:, 1].view(-1, 2)
+        widest = max(widest, int((edges[:, 1] - edges[:, 0]).max()))
+    assert 0 < widest <= 0.2 * 192
+
+
 def wide_stereo_example(size, draw):
     image, near = a_thing_far_away()
     return from_stereo(StereoFrame(image, image, 0.01 + 12 * near, None), size, draw)
@@ -222,6 +236,7 @@ def wide_stereo_example(size, draw):
 @pytest.mark.parametrize("make", [wide_photo_example, wide_stereo_example])
 def test_a_crop_without_a_hole_makes_way_for_another_of_its_rows(monkeypatch, make):
     plain(monkeypatch)
+    monkeypatch.setattr("trainers.inpaint_data.examples.STREAM_VIEW", ViewConfig(max_width=8))  # the photo stays as wide as it is
     stayed, empty, moved = 0, 0, set()
     for index in range(150):
         whole, part = (make(size, drawing(index=index)) for size in ((64, 256), (24, 32)))

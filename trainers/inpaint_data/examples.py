@@ -24,6 +24,7 @@ from torch import Tensor
 from trainers.inpaint_data.stored_maps import StereoFrame
 from zsdata.augment import AugmentConfig, augment
 from zsdata.synthesis.disparity import SMALLEST_DISPARITY_PX, AdaptiveDisparity, dilate_disparity, sharpen_disparity
+from zsdata.synthesis.view import ViewConfig
 from zsdata.synthesis.warp import forward_warp
 
 Draw = Callable[[str], np.random.Generator]  # the numbers of one example for a purpose
@@ -39,6 +40,7 @@ SYMMETRIC_COLOUR = replace(
     saturation=_JITTER.saturation,
     hue_turns=_JITTER.hue_turns,
 )
+STREAM_VIEW = ViewConfig()  # of the pairs whose holes are to be filled
 
 
 class Example(NamedTuple):
@@ -84,8 +86,8 @@ def from_stereo(frame: StereoFrame, size: tuple[int, int], draw: Draw) -> Exampl
 def from_photo(photo: np.ndarray, inverse_depth: Tensor, scale: AdaptiveDisparity, size: tuple[int, int], draw: Draw) -> Example:
     """An example of a photo, taken for a right image.
 
-    Mirrored half of the time. A photo that is smaller than the crop is enlarged to it. The disparity is made as in the stream: dilated
-    and sharpened.
+    Mirrored half of the time. A photo that is smaller than the crop is enlarged to it; one that is wider than two crops is brought to
+    that width, as in the stream, which makes no wider holes either. The disparity is made as in the stream: dilated and sharpened.
 
     Args:
         photo: uint8 [H, W, 3], RGB.
@@ -96,9 +98,10 @@ def from_photo(photo: np.ndarray, inverse_depth: Tensor, scale: AdaptiveDisparit
     mirror, *place, instead = draw("view").random(4)
     if mirror < 0.5:
         photo, inverse_depth = np.ascontiguousarray(photo[:, ::-1]), inverse_depth.flip(-1)
-    height, width = _enlarged(photo.shape[:2], size)
+    taken = STREAM_VIEW.taken_width(photo.shape[1], size[1]) / photo.shape[1]
+    height, width = _enlarged((round(photo.shape[0] * taken), round(photo.shape[1] * taken)), size)
     if (height, width) != photo.shape[:2]:
-        photo = cv2.resize(photo, (width, height), interpolation=cv2.INTER_LINEAR)
+        photo = cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA if width < photo.shape[1] else cv2.INTER_LINEAR)
         inverse_depth = F.interpolate(inverse_depth, (height, width), mode="bilinear", align_corners=False)
 
     rows, columns = _window((height, width), size, place)
