@@ -10,6 +10,7 @@ import torch
 from accelerate import Accelerator, DistributedType
 from accelerate.optimizer import AcceleratedOptimizer
 from accelerate.tracking import GeneralTracker
+from accelerate.utils import GradientAccumulationPlugin
 from torch.optim.lr_scheduler import LRScheduler
 
 WHOLE_ON_EACH = (DistributedType.NO, DistributedType.MULTI_CPU, DistributedType.MULTI_GPU)
@@ -29,6 +30,8 @@ def open_accelerator(mixed_precision: str | None, tracker: str | GeneralTracker 
             mixed_precision=mixed_precision,
             log_with=tracker,
             project_dir=str(output),
+            # A step has as many batches at the end of an epoch as ever; how many, each trainer says.
+            gradient_accumulation_plugin=GradientAccumulationPlugin(num_steps=1, sync_with_dataloader=False),
         )
     if tracker is not None and not accelerator.log_with:
         raise ImportError(f"the tracker {tracker} is not installed: pip install {tracker}, or choose another one with --tracker, or none")

@@ -156,6 +156,13 @@ def test_a_resumed_run_equals_the_unbroken_one(tar, tmp_path, accumulate, worker
         assert torch.equal(after.state_dict()[name], weight), name
 
 
+def test_every_step_has_as_many_batches_wherever_an_epoch_ends(tar, tmp_path, monkeypatch):
+    monkeypatch.setattr(loop, "LOG_EVERY_STEPS", 1)
+    run_training(tar, tmp_path / "run", config(steps=4, accumulate=3), epoch_size=10)
+    places = [(line["epoch"], line["samples"]) for line in read_lines(tmp_path / "run" / "log.jsonl")]
+    assert [10 * epoch + samples for epoch, samples in places] == [6, 12, 18, 24]
+
+
 @pytest.fixture
 def pairs_folder(tmp_path):
     return shifted_pairs(tmp_path / "pairs")
