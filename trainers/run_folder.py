@@ -21,6 +21,7 @@ from pickle import UnpicklingError
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
 from torch import nn
 
 from trainers.models import save_checkpoint
@@ -196,6 +197,9 @@ def _replace(folder: Path, fill: Callable[[Path], Any]) -> Path:
     """Puts a new folder, which `fill` fills, in the place of `folder`. At any moment there is the old one, none, or the new one, whole.
 
     Killed in between, it leaves hidden folders behind, which the next call removes: one run at a time writes to a folder.
+
+    Raises:
+        OSError: it cannot be written; names it, and how much room there is.
     """
     for left in folder.parent.glob(f".*{HIDDEN}"):
         shutil.rmtree(left)
@@ -207,6 +211,12 @@ def _replace(folder: Path, fill: Callable[[Path], Any]) -> Path:
         before = _hide(folder) if folder.exists() else None
         os.replace(unfinished, folder)
         _flush(folder.parent)
+    except (OSError, RuntimeError, SafetensorError) as error:  # a full disk is a riddle in torch's words, or in those of safetensors
+        free_mb = shutil.disk_usage(folder.parent).free // 10**6
+        raise OSError(
+            f"{folder} could not be written, with {free_mb:,} MB free on its disk: {error}. "
+            "Earlier checkpoints are whole; make room (a quota counts, too), and --resume goes on from the last one"
+        ) from error
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
     if before is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import resource
 import shutil
 import signal
 import sys
@@ -165,3 +166,20 @@ def test_a_damaged_checkpoint_is_named_file_and_all(tmp_path, file, content):
     (folder / file).write_bytes(content)
     with pytest.raises(ValueError, match=rf"{folder}/{file} is damaged.*resume from another checkpoint"):
         run_folder.load(folder)
+
+
+@pytest.mark.parametrize(("weights", "optimizer"), [(10**6, 1), (1, 10**6)])
+def test_a_disk_that_is_full_is_an_error_that_names_the_checkpoint_and_the_room_and_leaves_nothing(tmp_path, weights, optimizer):
+    first = save(tmp_path, 1, 1.0)
+
+    def fill_the_disk():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10**6, 10**6))
+        with pytest.raises(OSError, match=r"step-00000002 could not be written, with [\d,]+ MB free on its disk: .*--resume"):
+            run_folder.save(tmp_path, 2, nn.Linear(1, weights), {}, {"optimizer": torch.zeros(optimizer)}, {})
+
+    process = multiprocessing.get_context("fork").Process(target=fill_the_disk)
+    process.start()
+    process.join()
+    assert process.exitcode == 0
+    assert list((tmp_path / "checkpoints").iterdir()) == [first] == [run_folder.newest(tmp_path)]
