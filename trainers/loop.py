@@ -115,7 +115,7 @@ def train(
     run_folder.check_output(output, resume)
     accelerator = open_accelerator(config.mixed_precision, tracker, output)
     accelerator.gradient_accumulation_steps = config.accumulate
-    validation = Validation(sets, config.best_by)
+    validation = Validation(sets, config.best_by, config.evaluation_iterations)
     if config.channels_last:
         matcher.use_channels_last()
     if config.compile:
@@ -153,7 +153,9 @@ def train(
         step = state["step"]
         accelerator.print(f"resumed from {checkpoint} at step {step}")
         if validation.best is not None and accelerator.is_main_process:
-            run_folder.restore_best(checkpoint, output, validation.best["step"])
+            there = run_folder.restore_best(checkpoint, output, validation.best["step"])
+            if sets and not there:
+                validation.best = None  # or OUTPUT/best would be of no checkpoint until a better one comes
     require_one_place(gather_object([loader.state_dict()]))
     model, optimizer = accelerator.prepare(matcher, optimizer)
     model.train()

@@ -58,7 +58,8 @@ class EvaluationSet:
 class Validation:
     """Judges on several sets, shared out over the ranks, and remembers the best."""
 
-    def __init__(self, sets: Sequence[EvaluationSet], best_by: str = BEST_BY) -> None:
+    def __init__(self, sets: Sequence[EvaluationSet], best_by: str = BEST_BY, iterations: int | None = None) -> None:
+        """`iterations` of the matcher that is judged: values of other ones, or of other sets, are not compared."""
         if best_by not in METRICS:
             raise ValueError(f"best_by is one of {', '.join(METRICS)}; got {best_by!r}")
         names = [one.name for one in sets]
@@ -66,8 +67,9 @@ class Validation:
             raise ValueError(f"two evaluation sets have one name: {', '.join(names)}; put the pairs of both below one folder")
         self.sets = list(sets)
         self.best_by = best_by
-        self.best: dict[str, Any] | None = None  # {"step", "value", "by"}
+        self.best: dict[str, Any] | None = None  # {"step", "value", "by", "sets", "iterations"}
         self.judged_step: int | None = None  # the last one
+        self._told_by = {"by": best_by, "sets": sorted(names), "iterations": iterations}
 
     def judge(
         self, predict: Predict, *, device: torch.device, rank: int, world_size: int, out_of_memory: str = OUT_OF_MEMORY
@@ -97,7 +99,7 @@ class Validation:
         value = self.value(results)
         if value is None or (self.best is not None and value >= self.best["value"]):
             return False
-        self.best = {"step": step, "value": value, "by": self.best_by}
+        self.best = {"step": step, "value": value, **self._told_by}
         return True
 
     def value(self, results: dict[str, list[dict[str, Any]]]) -> float | None:
@@ -110,7 +112,8 @@ class Validation:
         return {"best": self.best, "judged_step": self.judged_step}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on with the best of an earlier run, unless that was told by another measure."""
+        """Goes on with the best of an earlier run, unless that was told by another measure, other sets or other iterations."""
         self.judged_step = state["judged_step"]
         best = state["best"]
-        self.best = best if best is not None and best["by"] == self.best_by else None
+        same = best is not None and all(best.get(name) == value for name, value in self._told_by.items() if self.sets or name == "by")
+        self.best = best if same else None

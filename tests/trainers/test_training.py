@@ -303,6 +303,23 @@ def test_the_best_of_another_folder_or_of_the_checkpoint_itself_is_restored(tar,
     assert not list((tmp_path / "elsewhere").glob(".*"))
 
 
+def test_where_the_best_is_gone_the_next_one_that_is_judged_takes_its_place(tar, tmp_path, pairs_folder):
+    settings = config(steps=4, evaluate_every=2, evaluation_iterations=1, best_by="epe")
+    sets = [EvaluationSet.parse(str(pairs_folder))]
+    run_training(tar, tmp_path / "run", settings, sets=sets)
+    checkpoint = run_folder.folder_of(tmp_path / "run", 2)
+    state = json.loads((checkpoint / "state.json").read_text())
+    state["validation"]["best"] |= {"step": 1, "value": 0.0}  # better than all that come
+    moved = tmp_path / "moved" / checkpoint.name
+    moved.parent.mkdir()
+    checkpoint.rename(moved)
+    (moved / "state.json").write_text(json.dumps(state))
+    AcceleratorState._reset_state(reset_partial_state=True)
+    run_training(tar, tmp_path / "resumed", settings, sets=sets, resume=moved)
+    assert json.loads((tmp_path / "resumed" / "best" / "state.json").read_text())["step"] == 4
+    assert json.loads((tmp_path / "resumed" / "evaluation.json").read_text())["best"]["step"] == 4
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

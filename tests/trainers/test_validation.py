@@ -51,7 +51,7 @@ def test_the_best_has_the_least_mean_over_the_sets():
     assert validation.is_best(results(one=2.0, two=4.0), step=10)
     assert not validation.is_best(results(one=1.0, two=5.0), step=20), "as good is not better"
     assert validation.is_best(results(one=3.0, two=2.0), step=30)
-    assert validation.best == {"step": 30, "value": 2.5, "by": "epe"}
+    assert validation.best == {"step": 30, "value": 2.5, "by": "epe", "sets": [], "iterations": None}
     assert not validation.is_best({}, step=40)
     assert validation.value(results(one=3.0, empty=None)) == 3.0
 
@@ -63,6 +63,24 @@ def test_the_best_is_forgotten_when_another_measure_tells_it():
     for validation in (same, other):
         validation.load_state_dict(first.state_dict())
     assert same.best == first.best and other.best is None
+
+
+def test_the_best_is_forgotten_when_other_sets_or_iterations_tell_it_and_kept_where_none_do(tmp_path):
+    write_benchmark("kitti2015", tmp_path / "kitti")
+    here = EvaluationSet.parse(f"kitti2015={tmp_path / 'kitti'}")
+    motorcycle = EvaluationSet.parse("motorcycle")
+    first = Validation([here], iterations=8)
+    first.is_best(results(kitti2015=2.0), step=10)
+    for sets, iterations, known in (
+        ([here], 8, True),
+        ([], 8, True),
+        ([motorcycle], 8, False),
+        ([here, motorcycle], 8, False),
+        ([here], 16, False),
+    ):
+        later = Validation(sets, iterations=iterations)
+        later.load_state_dict(first.state_dict())
+        assert later.best == (first.best if known else None), (sets, iterations)
 
 
 def test_ranks_share_the_pairs_and_know_all_scores_and_the_first_shows_how_far_it_is(tmp_path, monkeypatch, capsys):
