@@ -156,7 +156,7 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
         "--initial-weights",
         type=Path,
         metavar="PATH",
-        help="a published or own checkpoint to start from: .pth, .safetensors, or a folder of a run",
+        help="a published or own checkpoint to start from: .pth, .safetensors, or a checkpoint's folder, such as RUN/best",
     )
     training.add_argument(
         "--output", type=Path, required=True, metavar="DIR", help="the run's own folder: checkpoints, best, logs, evaluations"
