@@ -136,6 +136,7 @@ def train(
         rank=accelerator.process_index,
         world_size=accelerator.num_processes,
     )
+    pairs_per_step = config.batch_size * config.accumulate * accelerator.num_processes
     output.mkdir(parents=True, exist_ok=True)
     options = _options_of_a_run(config, model_config, loss_function)
     step, checkpoint, training, state = 0, None, None, {}
@@ -152,6 +153,13 @@ def train(
         validation.load_state_dict(state["validation"])
         step = state["step"]
         accelerator.print(f"resumed from {checkpoint} at step {step}")
+        before = state.get("pairs_per_step", pairs_per_step)
+        if before != pairs_per_step:
+            accelerator.print(
+                f"a step was of {before} pairs and is of {pairs_per_step} from here on ({config.batch_size} a batch, {config.accumulate} "
+                f"accumulated, {accelerator.num_processes} ranks): the learning rate goes on as it was; to go on as before, "
+                "change --batch-size or --accumulate"
+            )
         if validation.best is not None and accelerator.is_main_process:
             there = run_folder.restore_best(checkpoint, output, validation.best["step"])
             if sets and not there:
@@ -186,6 +194,7 @@ def train(
                         "guard": guard.state_dict(),
                         "options": options,
                         "world_size": accelerator.num_processes,
+                        "pairs_per_step": pairs_per_step,
                         "arguments": arguments,
                         "provenance": provenance(stream, arguments),
                     },
@@ -268,9 +277,8 @@ def train(
                         "skipped_steps": guard.skipped,
                         "learning_rate": schedule.get_last_lr()[0],
                     }
-                    pairs_seen = (step - mark.step) * config.batch_size * config.accumulate * accelerator.num_processes
                     here = mark_here()
-                    values |= mark.rates(pairs_seen, here)
+                    values |= mark.rates((step - mark.step) * pairs_per_step, here)
                     mark = here
                     progress.set_postfix_str(
                         f"loss {values['loss']:.2f}, EPE {values['epe']:.2f} px, {values['pairs_per_second']:.1f} pairs/s, "

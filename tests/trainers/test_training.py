@@ -163,6 +163,17 @@ def test_every_step_has_as_many_batches_wherever_an_epoch_ends(tar, tmp_path, mo
     assert [10 * epoch + samples for epoch, samples in places] == [6, 12, 18, 24]
 
 
+def test_a_resumed_run_whose_steps_have_other_numbers_of_pairs_says_so(tar, tmp_path, capsys):
+    run_training(tar, tmp_path / "run", config(steps=2))
+    checkpoint = run_folder.newest(tmp_path / "run")
+    for batch_size, accumulate, said in ((1, 2, False), (1, 1, True)):
+        AcceleratorState._reset_state(reset_partial_state=True)
+        capsys.readouterr()
+        settings = config(steps=2, batch_size=batch_size, accumulate=accumulate)
+        run_training(tar, tmp_path / f"accumulate {accumulate}", settings, resume=checkpoint)
+        assert ("a step was of 2 pairs and is of 1 from here on" in capsys.readouterr().out) == said
+
+
 @pytest.fixture
 def pairs_folder(tmp_path):
     return shifted_pairs(tmp_path / "pairs")
