@@ -85,6 +85,28 @@ def test_a_photo_with_a_dot_in_its_stem_is_reported_as_no_other_tool_finds_it_ei
     ]
 
 
+def test_each_photo_with_a_dot_in_its_stem_is_reported_not_one_for_all_that_share_a_key(shard):
+    """As Dropbox names camera uploads: all of an hour have one key."""
+    names = [f"2023-05-01 12.30.{second}.jpg" for second in range(11, 15)]
+    faults = []
+    assert [key for key, _ in read_shard(shard(*((name, b"0") for name in ("a.jpg", "b.jpg", *names))), faults.append)] == ["a", "b"]
+    assert [fault.reason for fault in faults] == [
+        f'no photo: the extension begins at the first dot of the name, .30.{second}.jpg; rename it ("2023-05-01 12")'
+        for second in range(11, 15)
+    ]
+    assert len({fault.offset for fault in faults}) == 4
+
+
+def test_photos_that_only_a_dot_makes_part_of_another_are_reported_and_annotations_are_not(shard):
+    names = ["a.jpg", "a.mask.png", "a.json", "b.jpg", "b.mask.png", "scan.jpg", "scan.1.jpg", "scan.2.jpg", "scan.txt"]
+    faults = []
+    assert [key for key, _ in read_shard(shard(*((name, b"0") for name in names)), faults.append)] == ["a", "b", "scan"]
+    assert [fault.reason for fault in faults] == [
+        f'no photo of its own: the extension begins at the first dot of the name, .{number}.jpg; rename it if it is one ("scan")'
+        for number in (1, 2)
+    ]
+
+
 def test_a_photo_that_swallowed_the_next_member_is_damage(shard):
     url = shard(("a.jpg", b"a" * 1200), ("b.jpg", b"b" * 500), ("c.jpg", b"c"))
     with open(url, "rb") as file:

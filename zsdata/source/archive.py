@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -35,6 +37,7 @@ OTHER_IMAGE_EXTENSIONS = frozenset(  # of files that a user may take for photos 
     }
 )
 DEPTH_EXTENSIONS = ("depth.npy", "depth.png")  # of a photo's depth map; where both are there, the first one counts
+_DIGIT_OR_SPACE = re.compile(r"[\d\s]")
 MAX_PHOTO_BYTES = 1 << 27  # 128 MiB; a 60-megapixel photo has 10 to 120 MB
 
 
@@ -91,8 +94,9 @@ def photo_members(
     """The photos of an open shard: regular members with the extension jpg, jpeg, png or webp.
 
     Args:
-        on_problem: gets the damages, each member that is meant as a photo but is none (the second of a key, a link, another format), and
-            each sample without a photo. Where `on_depth` is given, likewise of depth maps.
+        on_problem: gets the damages, each member that is meant as a photo but is none (the second of a key, a link, another format, a
+            name with a dot that makes it a part of another sample), and each sample without a photo. Where `on_depth` is given, likewise
+            of depth maps.
         on_depth: gets each depth map (KEY.depth.npy, KEY.depth.png) as it comes, before or after its photo or without one.
         strict: damage raises instead.
 
@@ -105,7 +109,7 @@ def photo_members(
 
     keys: set[str] = set()
     refused: set[str] = set()
-    beside: dict[str, _Beside] = {}
+    beside: dict[str, dict[str, int]] = {}  # what a sample has but its photo: by extension, where the first of it lies
     last: PhotoMember | None = None
     for member in walk_tar(file, None if strict else on_damage):
         last = None
@@ -128,14 +132,14 @@ def photo_members(
         elif extension in OTHER_IMAGE_EXTENSIONS:
             reason = f"not a JPEG, PNG or WebP: .{extension}"
         else:
-            extensions = beside.setdefault(key, _Beside(member.offset, [])).extensions
+            extensions = beside.setdefault(key, {})
             if on_depth is not None and extension in DEPTH_EXTENSIONS:
                 fault = _depth_fault(member, seen=extension in extensions)
                 if fault is None:
                     on_depth(DepthMember(key, extension, member.offset, member.size))
                 else:
                     on_problem(Problem(file.url, key, member.offset, fault))
-            extensions.append(extension)
+            extensions.setdefault(extension, member.offset)
             continue
         refused.add(key)
         on_problem(Problem(file.url, key, member.offset, reason))
@@ -165,25 +169,26 @@ def _ends_in_zeros(file: ShardFile, photo: PhotoMember) -> bool:
     return photo.size >= 64 and not file.read_at(photo.offset + photo.size - 64, 64).strip(b"\0")
 
 
-class _Beside(NamedTuple):
-    """What a sample has beside its photo: where the first of it lies, and the extensions."""
-
-    offset: int
-    extensions: list[str]
-
-
-def _without_photo(url: str, keys: set[str], refused: set[str], beside: dict[str, _Beside]) -> Iterator[Problem]:
-    """The samples whose photo is missing: they have a depth map, an annotation as the photos of this shard have it, or a photo by another
-    name."""
-    usual = {extension for key in keys & beside.keys() for extension in beside[key].extensions} | set(DEPTH_EXTENSIONS)
-    for key, (offset, extensions) in beside.items():
-        if key in keys or key in refused:
-            continue
-        dotted = next((extension for extension in extensions if extension.rpartition(".")[2] in PHOTO_EXTENSIONS), None)
-        if dotted is not None and dotted not in usual:
-            yield Problem(url, key, offset, f"no photo: the extension begins at the first dot of the name, .{dotted}; rename it")
-        elif not usual.isdisjoint(extensions):
-            yield Problem(url, key, offset, f"no photo: only {', '.join('.' + extension for extension in extensions)}")
+def _without_photo(url: str, keys: set[str], refused: set[str], beside: dict[str, dict[str, int]]) -> Iterator[Problem]:
+    """The samples whose photo is missing: they have a depth map, or an annotation as the photos of this shard have it; and each photo that
+    belongs to a sample of other photos only because its name has a dot ("2023-05-01 12.30.11.jpg")."""
+    samples = Counter(extension for extensions in beside.values() for extension in extensions)
+    usual = {extension for key in keys & beside.keys() for extension in beside[key]} | set(DEPTH_EXTENSIONS)
+    for key, extensions in beside.items():
+        dotted = [extension for extension in extensions if extension.rpartition(".")[2] in PHOTO_EXTENSIONS]
+        if key in keys:
+            for extension in dotted:
+                if samples[extension] == 1 and _DIGIT_OR_SPACE.search(extension):  # else an annotation, such as .mask.png
+                    reason = f"no photo of its own: the extension begins at the first dot of the name, .{extension}; rename it if it is one"
+                    yield Problem(url, key, extensions[extension], reason)
+        elif key not in refused:
+            dotted = [extension for extension in dotted if extension not in usual]
+            for extension in dotted:
+                reason = f"no photo: the extension begins at the first dot of the name, .{extension}; rename it"
+                yield Problem(url, key, extensions[extension], reason)
+            if not dotted and not usual.isdisjoint(extensions):
+                offset = next(iter(extensions.values()))
+                yield Problem(url, key, offset, f"no photo: only {', '.join('.' + extension for extension in extensions)}")
 
 
 def read_shard(url: str, on_damage: Callable[[BadShard], None] | None = None) -> Iterator[tuple[str, bytes]]:
