@@ -114,8 +114,8 @@ def _parser() -> argparse.ArgumentParser:
         "pack a folder of photos into shards",
         "Packs the JPEG, PNG and WebP photos in FOLDER and its subfolders into uncompressed tars (shards) in OUTPUT. "
         "A depth map NAME.depth.npy or NAME.depth.png beside a photo NAME.jpg is packed with it, for --depth stored. "
-        "Photos are copied byte for byte; those that zsdata cannot use are left out and listed with the reason. "
-        "FOLDER itself stays as it is.",
+        "Photos are copied byte for byte; those that zsdata cannot use are left out and listed with the reason, and files without an "
+        "image's extension are counted. FOLDER itself stays as it is.",
         example="zsdata pack holiday-photos shards",
     )
     command.add_argument("folder", metavar="FOLDER", help="folder of photos")
@@ -345,6 +345,8 @@ def _pack_and_tell(make_shards: Callable[..., PackReport], options: argparse.Nam
             print(f"  {_printable(path)}: {_printable(reason)}")
         if len(report.skipped) > SKIPPED_SHOWN:
             print(f"  ... and {len(report.skipped) - SKIPPED_SHOWN:,} more")
+    if report.passed_over:
+        print(_printable(report.passed_over_in_words))
     print(f"to look at pairs made from them: zsdata preview --sources {_printable(shlex.quote(options.output))} --output preview.png")
     return OK
 

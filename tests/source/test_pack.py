@@ -112,6 +112,26 @@ def test_what_cannot_be_used_is_left_out_and_listed(photos, tmp_path):
     ]
 
 
+def test_files_that_are_no_photos_by_their_names_are_counted_by_extension(photos, tmp_path):
+    """Downloads without an extension are photos that their owner would miss."""
+    fill(photos, "a.jpg", "12345", "below/678", "b.jpg.1")
+    for other in ("notes.txt", ".hidden", "Thumbs.db", "__MACOSX"):
+        (photos / other).write_bytes(b"no photo")
+    report = pack(photos, tmp_path / "shards")
+    assert (report.photos, report.passed_over) == (1, {"no extension": 2, ".1": 1, ".txt": 1, ".db": 1})
+    with pytest.raises(
+        ValueError, match=r"no photo to pack in .* JPEG, PNG or WebP file; passed over by their names: 1 with no extension$"
+    ):
+        pack(photos / "below", tmp_path / "other")
+
+
+@pytest.mark.parametrize("extension", ["cr3", "raf", "ORF", "rw2", "pef", "srw", "mpo"])
+def test_photos_of_every_camera_maker_are_packed_or_listed(photos, tmp_path, extension):
+    fill(photos, "a.jpg")
+    (photos / f"b.{extension}").write_bytes(b"raw")
+    assert pack(photos, tmp_path / "shards").skipped == [(f"b.{extension}", "not a JPEG, PNG or WebP: unknown format")]
+
+
 def test_photos_with_a_side_too_short_are_left_out_where_a_limit_is_given(photos, tmp_path):
     files = fill(photos, "good.jpg")  # 20 x 30
     (photos / "icon.png").write_bytes(encode(picture(16, 30), "PNG"))

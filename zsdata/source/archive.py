@@ -31,9 +31,16 @@ OTHER_IMAGE_EXTENSIONS = frozenset(  # of files that a user may take for photos 
         "psd",
         "dng",
         "cr2",
+        "cr3",
         "nef",
         "arw",
+        "raf",
+        "orf",
+        "rw2",
+        "pef",
+        "srw",
         "raw",
+        "mpo",
     }
 )
 DEPTH_EXTENSIONS = ("depth.npy", "depth.png")  # of a photo's depth map; where both are there, the first one counts

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import tarfile
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -18,6 +19,8 @@ from zsdata.source.depth_map import DepthMap, decode_depth
 from zsdata.source.index import INDEX_ENDING
 from zsdata.source.photo import probe_photo, usable_photo
 from zsdata.source.writing import writing
+
+EXTENSIONS_SHOWN = 5
 
 _BLOCK = 512
 _DEPTH_FILE = re.compile(rf"(.+)\.({'|'.join(map(re.escape, DEPTH_EXTENSIONS))})", re.IGNORECASE | re.DOTALL)
@@ -33,6 +36,14 @@ class PackReport:
     bytes: int = 0  # of the shards
     shards: list[str] = field(default_factory=list)  # their paths, in order
     skipped: list[tuple[str, str]] = field(default_factory=list)  # path in the folder, reason
+    passed_over: Counter[str] = field(default_factory=Counter)  # files that are no images by their names: how many, by extension
+
+    @property
+    def passed_over_in_words(self) -> str:
+        """The most frequent of them first, as in "passed over by their names: 12 with .txt, 1 with no extension"; empty without any."""
+        kinds = [f"{count:,} with {extension}" for extension, count in self.passed_over.most_common(EXTENSIONS_SHOWN)]
+        more = self.passed_over.total() - sum(count for _, count in self.passed_over.most_common(EXTENSIONS_SHOWN))
+        return "passed over by their names: " + ", ".join(kinds + [f"{more:,} more"] * bool(more)) if kinds else ""
 
 
 def pack(
@@ -49,8 +60,8 @@ def pack(
     Every photo is decoded once: what zsdata cannot use is left out and reported. Bytes are copied as they are, originals stay untouched.
     A photo's key is its path without the extension, dots in its base name written as "_"; a key that is taken gets "_2", "_3" appended.
     Its extension is that of its content. A depth map NAME.depth.npy or NAME.depth.png goes with the photo NAME.*, as KEY.depth.npy or .png,
-    if a stream can use it (see `zsdata.source.depth_map`); of both the first one. The same folder gives the same bytes. Hidden files and
-    files that are no images are passed over; symbolic links are read through.
+    if a stream can use it (see `zsdata.source.depth_map`); of both the first one. The same folder gives the same bytes. Hidden files are
+    passed over, and so are files that have no image's extension, which are counted; symbolic links are read through.
 
     Args:
         shortest_side_px: a photo with a shorter side is left out.
@@ -69,11 +80,11 @@ def pack(
         raise ValueError(f"photos_per_shard is at least 1, got {photos_per_shard}")
     name = re.sub(r"[^A-Za-z0-9_-]", "_", source.resolve().name) or "photos"
     _check_output(source, target, name, overwrite)
-    files = sorted(_files(source, target), key=os.fsencode)
+    report, keys = PackReport(), set()
+    files = sorted(_files(source, target, report.passed_over), key=os.fsencode)
     photos = [path for path in files if not _DEPTH_FILE.fullmatch(path)]
     depths = _DepthFiles(source, [path for path in files if _DEPTH_FILE.fullmatch(path)])
     target.mkdir(parents=True, exist_ok=True)
-    report, keys = PackReport(), set()
     with _Shards(target, name, photos_per_shard) as shards:
         for path in Progress(photos, desc="packing", unit="photo", disable=None if progress is None else not progress):
             try:
@@ -94,8 +105,10 @@ def pack(
             report.photos += 1
         report.skipped += depths.left()
         if not report.photos:
-            skipped = "".join(f"; {path}: {reason}" for path, reason in report.skipped[:3])
-            raise ValueError(f"no photo to pack in {source}: a photo is a JPEG, PNG or WebP file{skipped}")
+            reasons = [f"{path}: {reason}" for path, reason in report.skipped[:3]] + [report.passed_over_in_words] * bool(
+                report.passed_over
+            )
+            raise ValueError("; ".join([f"no photo to pack in {source}: a photo is a JPEG, PNG or WebP file", *reasons]))
         report.shards = [os.fspath(path) for path in shards.publish()]
     report.bytes = sum(os.path.getsize(path) for path in report.shards)
     return report
@@ -206,8 +219,11 @@ def _shards_of(target: Path, name: str) -> list[Path]:
     return [path for path in target.glob("*.tar") if re.fullmatch(re.escape(name) + r"-[0-9]{6}\.tar", path.name)]
 
 
-def _files(source: Path, output: Path, ancestors: tuple[str, ...] = (), below: str = "") -> Iterator[str]:
-    """Paths of the images and depth maps below `source`, relative to it; through links, but not round in circles, and not into `output`."""
+def _files(source: Path, output: Path, passed_over: Counter[str], ancestors: tuple[str, ...] = (), below: str = "") -> Iterator[str]:
+    """Paths of the images and depth maps below `source`, relative to it; through links, but not round in circles, and not into `output`.
+
+    Counts the other files in `passed_over`, by extension.
+    """
     real = os.path.realpath(source / below)
     if real in ancestors or real == os.path.realpath(output):
         return
@@ -216,9 +232,13 @@ def _files(source: Path, output: Path, ancestors: tuple[str, ...] = (), below: s
             if entry.name.startswith(".") or entry.name == "__MACOSX":
                 continue
             if entry.is_dir():
-                yield from _files(source, output, (*ancestors, real), below + entry.name + "/")
-            elif entry.name.rpartition(".")[2].lower() in PHOTO_EXTENSIONS | OTHER_IMAGE_EXTENSIONS or _DEPTH_FILE.fullmatch(entry.name):
+                yield from _files(source, output, passed_over, (*ancestors, real), below + entry.name + "/")
+                continue
+            _, dot, extension = entry.name.lower().rpartition(".")
+            if extension in PHOTO_EXTENSIONS | OTHER_IMAGE_EXTENSIONS or _DEPTH_FILE.fullmatch(entry.name):
                 yield below + entry.name
+            else:
+                passed_over[dot + extension if dot else "no extension"] += 1
 
 
 def _read_photo(path: Path, shortest_side_px: int) -> tuple[bytes, str]:
