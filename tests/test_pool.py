@@ -6,6 +6,8 @@ import os
 import re
 import resource
 import signal
+import subprocess
+import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -321,3 +323,15 @@ def test_memory_without_a_name_is_found_where_python_does_not_offer_it(monkeypat
     pool = open_pool(batches=3, context="fork")
     assert len(list(pool)) == 3
     pool.close()
+
+
+@pytest.mark.parametrize("method", ["spawn", "forkserver"])
+def test_a_script_that_begins_anew_in_its_workers_is_told_what_it_lacks(tmp_path, method):
+    """As "Ten lines" would where Python starts processes so by itself, which it does on Linux from 3.14 on."""
+    script = tmp_path / "script.py"
+    script.write_text(f"from tests.test_pool import open_pool\nnext(open_pool(batches=1, processes=1, context={method!r}))\n")
+    done = subprocess.run(
+        [sys.executable, script], env={**os.environ, "PYTHONPATH": os.getcwd()}, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 1
+    assert re.search(rf"WorkerLost: .* exit code 1; .*{method}.*if __name__ == \"__main__\"", done.stderr)

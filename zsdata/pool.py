@@ -102,6 +102,7 @@ class WorkerPool:
         self._timeout_seconds = timeout_seconds
         self._ahead = ahead
         self._take = take
+        self._start_method = multiprocessing.get_context(context).get_start_method()
         self._taken = 0
         self._members: list[_Member] = []
         self.close = weakref.finalize(self, _end, self._members, os.getpid())
@@ -227,6 +228,11 @@ class WorkerPool:
         hint = ""
         if code == -signal.SIGKILL:
             hint = "; the kernel kills processes so when memory runs out: fewer workers or a smaller batch need less"
+        elif code == 1 and not doing.begun and self._start_method != "fork":
+            hint = (
+                f'; started by "{self._start_method}", it runs the script once more: put what the script does under '
+                'if __name__ == "__main__":, or give the loader multiprocessing_context="fork"'
+            )
         return WorkerLost(f"worker {member.number} of {len(self._members)} (process {member.process.pid}) {reason}; it was {place}{hint}")
 
 
