@@ -660,3 +660,10 @@ def test_a_pair_that_is_made_on_the_device_says_which_one_failed(tar):
 
     with pytest.raises(RuntimeError, match=r"sample \d+ of epoch 0 .*photos.tar.* failed: no depth today"):
         next(iter(open_stream(tar, depth=fails, depth_placement="device").loader(2)))
+
+
+@pytest.mark.parametrize("device", ["cuda", "cuda:1"])
+def test_a_gpu_that_is_not_there_is_told_when_the_loader_is_made(tar, device, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    with pytest.raises(ValueError, match=rf'device="{device}", but PyTorch sees 0 GPUs here; device="cpu" needs none'):
+        ZeroStereoStream(tar, depth=layered_depth, inpaint=grey_fill).loader(batch_size=1, num_workers=0, device=device)

@@ -300,6 +300,8 @@ class ZeroStereoStream(IterableDataset):
         if self._recipe.size is None and batch_size != 1:
             raise ValueError(f"whole photos (size=None) differ in size and come one at a time: batch_size is 1; got {batch_size}")
         device = torch.device(device)
+        if device.type == "cuda" and (device.index or 0) >= (gpus := torch.cuda.device_count()):
+            raise ValueError(f'device="{device}", but PyTorch sees {gpus} GPU{"" if gpus == 1 else "s"} here; device="cpu" needs none')
         if (rank is None) != (world_size is None):
             raise ValueError(f"rank and world_size are given together or not at all; got rank={rank}, world_size={world_size}")
         rank, world_size = launched_as() if rank is None or world_size is None else (rank, world_size)
