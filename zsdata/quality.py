@@ -13,9 +13,9 @@ class QualityGate:
     """When a pair is refused; its photo is then counted with the reason and replaced, as one that cannot be read.
 
     The defaults let 486 of 486 views of 243 natural photographs pass, with the built-in depth at 384x512: their worst are a hole share of
-    a quarter, a visible share of two thirds, a depth range of 0.3 and a consistency of 0.9. What they refuse: strips such as 900x40 photos that are
-    enlarged until the disparity leaves the crop, depth that is one plane, and estimators that see another scene in the mirror. Depth
-    networks are not even shown strips: see `Preprocessing.refuses`.
+    a quarter, a visible share of two thirds, a depth range of 0.3 and a consistency of 0.9. What they refuse: strips such as 900x40 photos
+    that are enlarged until the disparity leaves the crop, depth that is one plane, and estimators that see another scene in the mirror.
+    Depth networks are not even shown strips: see `Preprocessing.refuses`.
 
     Attributes:
         max_hole_share: of the right view's pixels, the share that no left pixel shows and that would be invented. 1 lets all pass.
