@@ -318,6 +318,38 @@ def test_a_pool_that_is_dropped_or_forked_ends_its_workers_once():
     assert gone(pids, 0)
 
 
+@pytest.mark.parametrize(("handled", "ends"), [(True, False), (False, True)])
+def test_who_handles_sigterm_keeps_its_workers(handled, ends):
+    """A cluster sends it to all processes at once, and a trainer has yet to save its place."""
+    before = signal.signal(signal.SIGTERM, (lambda *_: None) if handled else signal.SIG_DFL)
+    try:
+        pool = open_pool(processes=1)
+        next(pool)
+        for pid in processes_of(pool):
+            os.kill(pid, signal.SIGTERM)
+        if ends:
+            with pytest.raises(WorkerLost, match="was killed by SIGTERM"):
+                list(pool)
+        else:
+            assert len([next(pool) for _ in range(5)]) == 5
+        pids = processes_of(pool)
+        pool.close()
+        assert gone(pids, 0)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def test_a_program_that_handles_sigterm_and_forgets_its_pool_ends():
+    """At the exit Python sends SIGTERM to the processes that are left, and waits for them: before what was to be finalized, if that was
+    asked for earlier, as by a temporary folder."""
+    script = (
+        "import signal, tempfile; folder = tempfile.TemporaryDirectory(); signal.signal(signal.SIGTERM, print); "
+        "from tests.test_pool import open_pool; pool = open_pool(); next(pool)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
 def test_memory_without_a_name_is_found_where_python_does_not_offer_it(monkeypatch):
     monkeypatch.delattr(os, "memfd_create")
     pool = open_pool(batches=3, context="fork")

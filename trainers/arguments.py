@@ -162,7 +162,11 @@ def add_training_arguments(parser: argparse.ArgumentParser) -> None:
         "--output", type=Path, required=True, metavar="DIR", help="the run's own folder: checkpoints, best, logs, evaluations"
     )
     training.add_argument(
-        "--resume", type=Path, metavar="DIR", help="go on from the newest checkpoint of that run, or from that checkpoint"
+        "--resume",
+        type=Path,
+        metavar="DIR",
+        help="go on from the newest checkpoint of that run, or from that checkpoint; "
+        "with --output's folder the run begins where there is none yet, so that a cluster can repeat the command (SIGTERM saves one)",
     )
     training.add_argument(
         "--save-every",
@@ -306,18 +310,19 @@ def train_as_told(arguments: argparse.Namespace, matcher: Matcher, loss_function
     if (arguments.evaluate_every is not None or arguments.evaluate_first) and not sets:
         option = "--evaluate-first" if arguments.evaluate_first else "--evaluate-every"
         raise ValueError(f"{option} needs --evaluate: what is to be judged on?")
-    train(
-        matcher,
-        loss_function,
-        open_stream(arguments),
-        train_config(arguments),
-        output=arguments.output,
-        model_config={"model": name, "options": options},
-        arguments={argument: str(value) for argument, value in vars(arguments).items()},
-        resume=arguments.resume,
-        sets=sets,
-        tracker=None if arguments.tracker == "none" else arguments.tracker,
-    )
+    with run_folder.claimed(arguments.output):
+        train(
+            matcher,
+            loss_function,
+            open_stream(arguments),
+            train_config(arguments),
+            output=arguments.output,
+            model_config={"model": name, "options": options},
+            arguments={argument: str(value) for argument, value in vars(arguments).items()},
+            resume=arguments.resume,
+            sets=sets,
+            tracker=None if arguments.tracker == "none" else arguments.tracker,
+        )
 
 
 def run(main: Any) -> None:

@@ -66,18 +66,18 @@ def main() -> None:
     )
     config = TuneConfig(**{name: getattr(arguments, name) for name in names})
     examples = Examples(open_sources(arguments), tuple(arguments.size), config.seed, config.batch_size)
-    folder = tune(
-        local_pipeline(arguments.pipeline, arguments.subfolder, arguments.revision),
-        examples,
-        config,
-        subfolder=arguments.subfolder,
-        output=arguments.output,
-        arguments={argument: str(value) for argument, value in vars(arguments).items()},
-        resume=arguments.resume,
-        pairs=validation_pairs(arguments.validate),
-        tracker=None if arguments.tracker == "none" else arguments.tracker,
-    )
-    print(f"the pipeline is {folder}")
+    with run_folder.claimed(arguments.output):
+        tune(
+            local_pipeline(arguments.pipeline, arguments.subfolder, arguments.revision),
+            examples,
+            config,
+            subfolder=arguments.subfolder,
+            output=arguments.output,
+            arguments={argument: str(value) for argument, value in vars(arguments).items()},
+            resume=arguments.resume,
+            pairs=validation_pairs(arguments.validate),
+            tracker=None if arguments.tracker == "none" else arguments.tracker,
+        )
 
 
 def open_sources(arguments: argparse.Namespace) -> dict[str, Source]:
@@ -173,7 +173,11 @@ def _parser() -> argparse.ArgumentParser:
         "--output", type=Path, required=True, metavar="DIR", help="the run's own folder: checkpoints, best, logs, validation.jsonl"
     )
     training.add_argument(
-        "--resume", type=Path, metavar="DIR", help="go on from the newest checkpoint of that run, or from that checkpoint"
+        "--resume",
+        type=Path,
+        metavar="DIR",
+        help="go on from the newest checkpoint of that run, or from that checkpoint; with --output's folder the run begins where there is "
+        "none yet, so that a cluster can repeat the command (SIGTERM saves one)",
     )
     training.add_argument(
         "--save-every", type=int, default=defaults.save_every, help=f"steps between checkpoints (default: {defaults.save_every:,})"

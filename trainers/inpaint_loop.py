@@ -30,6 +30,7 @@ from trainers.noise_prediction import NoisePrediction
 from trainers.pairs_on_disk import StereoPair
 from trainers.pipeline_folder import UNET, frozen_digest, write_pipeline
 from trainers.step_guard import StepGuard
+from trainers.termination import Terminated, Termination
 from trainers.weight_average import WeightAverage, weights_of
 from zsdata.faults import FailureBudget, FaultLog
 from zsdata.position import Position, require_one_place
@@ -108,7 +109,7 @@ def tune(
             those of another run.
         arguments: what the run was started with, saved with its state.
         subfolder: where in `pipeline` it lies.
-        resume: a run's folder or one of its checkpoints.
+        resume: a run's folder or one of its checkpoints; `output` itself may still be without any.
         pairs: stereo pairs with dense ground truth; their holes are filled and judged before the first step, at every checkpoint and on
             resume. The checkpoint of the highest mean PSNR is kept in OUTPUT/best.
         tracker: any of Accelerate's, or None.
@@ -119,8 +120,9 @@ def tune(
         TrainingDiverged: too many steps in a row had to be skipped, because their loss was not finite or exploded.
         NoUsablePhoto, TooManyFaults, WorkerLost: examples cannot be made.
         MemoryError: the device's memory is too small; says what to lower.
+        Terminated: a rank got SIGTERM; the checkpoint of this step is saved.
     """
-    run_folder.check_output(output, resume)
+    checkpoint = run_folder.check_output(output, resume)
     accelerator = open_accelerator(config.mixed_precision, tracker, output)
     accumulate = accelerator.gradient_accumulation_steps = config.accumulate(accelerator.num_processes)
     if any(side <= 0 or side % CELL_PX for side in examples.size):
@@ -133,9 +135,7 @@ def tune(
     kept = {name: getattr(config, name) for name in ("steps", "learning_rate", "weight_decay", "ema")}
     options = {"model": MODEL, **kept, "the pipeline's digest": frozen_digest(pipeline / subfolder)}
     unet, step, training, state, refused_before = parts.unet, 0, None, {}, Counter[str]()
-    checkpoint: Path | None = None
-    if resume is not None:
-        checkpoint = run_folder.newest(resume)
+    if checkpoint is not None:
         training, state = run_folder.load(checkpoint)
         run_folder.require_options(checkpoint, state, options, f"--pipeline {checkpoint / PIPELINE}")
         step, refused_before = state["step"], Counter(state["refused"])
@@ -144,6 +144,8 @@ def tune(
         Position.from_state(state["examples"], examples.position(step))
         unet = type(unet).from_pretrained(checkpoint / PIPELINE / UNET, use_safetensors=True)
         accelerator.print(f"resumed from {checkpoint} at step {step}")
+    elif resume is not None:
+        accelerator.print(f"no checkpoint in {resume} yet: the run begins")
     require_one_place(gather_object([examples.position(step).to_state()]))
     average = None if config.ema is None else WeightAverage(unet, config.ema)
     if training is not None and training["weights"]:
@@ -224,7 +226,7 @@ def tune(
     validate(checkpoint)
     asked = requests(step, config.steps, config.batch_size, config.micro_batch, accelerator.process_index, accelerator.num_processes)
     progress = Progress(total=config.steps, initial=step, unit="step", disable=not accelerator.is_main_process, dynamic_ncols=True)
-    with making(examples, asked, config.workers, accelerator.device) as batches:
+    with Termination() as termination, making(examples, asked, config.workers, accelerator.device) as batches:
         mark, waited = (step, time.perf_counter()), 0.0
         while step < config.steps:
             skipped = False
@@ -268,15 +270,22 @@ def tune(
                 if accelerator.is_main_process:
                     run_folder.append(output / "log.jsonl", {"step": step, **values, "refused": reasons})
                 accelerator.log({**values, "refused": sum(reasons.values())}, step=step)
+            if step < config.steps and termination.asked(accelerator.device):
+                saved = save()
+                accelerator.print(f"asked to end by SIGTERM: {saved} is saved, and --resume {output} goes on from it")
+                accelerator.end_training()
+                raise Terminated
             if step % config.save_every == 0 or step == config.steps:
                 validate(save())
     progress.close()
     accelerator.print(_summary(refused()))
+    folder = run_folder.folder_of(output, step) / PIPELINE
+    accelerator.print(f"the pipeline is {folder}")
     if cases and best is not None:
         where = output / "best" / PIPELINE
         accelerator.print(f"the best pipeline is {where}, of step {best['step']}: PSNR {best['psnr']:.2f} dB in the holes")
     accelerator.end_training()
-    return run_folder.folder_of(output, step) / PIPELINE
+    return folder
 
 
 def _validation_cases(pairs: list[StereoPair] | None, examples: Examples, accelerator: Accelerator) -> list[HoleCase]:

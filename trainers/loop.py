@@ -23,6 +23,7 @@ from trainers.models.checkpoint import WEIGHTS_FILE
 from trainers.provenance import provenance
 from trainers.ranks import mean_over_ranks
 from trainers.step_guard import StepGuard
+from trainers.termination import Terminated, Termination
 from trainers.validation import BEST_BY, EvaluationSet, Validation
 from trainers.weight_average import WeightAverage, weights_of
 from zsdata import StereoBatch, ZeroStereoStream
@@ -102,7 +103,7 @@ def train(
             where it holds the checkpoints of another run.
         model_config: {"model": name, "options": {...}}, saved with the weights.
         arguments: what the run was started with, saved with its state.
-        resume: a run's folder or one of its checkpoints.
+        resume: a run's folder or one of its checkpoints; `output` itself may still be without any.
         sets: what to judge by at the end, every `config.evaluate_every` steps, and first of all where `config.evaluate_first`. Each time
             a checkpoint is saved before, and copied to OUTPUT/best when it is the best so far, see `Validation.is_best`. A run that was
             stopped in between begins with judging when it is resumed.
@@ -111,8 +112,9 @@ def train(
         ValueError, ImportError, OSError: options, a tracker or a checkpoint that cannot be used, or a rank that has other photos.
         MemoryError: the device's memory is too small; says what to lower.
         TrainingDiverged: too many steps in a row had to be skipped.
+        Terminated: a rank got SIGTERM; the checkpoint of this step is saved.
     """
-    run_folder.check_output(output, resume)
+    checkpoint = run_folder.check_output(output, resume)
     accelerator = open_accelerator(config.mixed_precision, tracker, output)
     accelerator.gradient_accumulation_steps = config.accumulate
     validation = Validation(sets, config.best_by, config.evaluation_iterations)
@@ -139,12 +141,13 @@ def train(
     pairs_per_step = config.batch_size * config.accumulate * accelerator.num_processes
     output.mkdir(parents=True, exist_ok=True)
     options = _options_of_a_run(config, model_config, loss_function)
-    step, checkpoint, training, state = 0, None, None, {}
-    if resume is not None:
-        checkpoint = run_folder.newest(resume)
+    step, training, state = 0, None, {}
+    if checkpoint is not None:
         training, state = run_folder.load(checkpoint)
         run_folder.require_options(checkpoint, state, options, f"--initial-weights {checkpoint / WEIGHTS_FILE}")
         load_checkpoint(matcher, checkpoint / WEIGHTS_FILE)
+    elif resume is not None:
+        accelerator.print(f"no checkpoint in {resume} yet: the run begins")
     average = None if config.ema is None else WeightAverage(matcher, config.ema)
     if checkpoint is not None and training is not None:
         if training["weights"]:  # what was saved for use is the average
@@ -237,6 +240,7 @@ def train(
 
     results: dict[str, list[dict[str, Any]]] = {}
     with (
+        Termination() as termination,
         loader,
         Progress(total=config.steps, initial=step, unit="step", disable=not accelerator.is_main_process, dynamic_ncols=True) as progress,
     ):
@@ -292,6 +296,11 @@ def train(
                     accelerator.log(values, step=step)
                 if step == config.steps:
                     break
+                if termination.asked(accelerator.device):
+                    saved = save()
+                    accelerator.print(f"asked to end by SIGTERM: {saved} is saved, and --resume {output} goes on from it")
+                    accelerator.end_training()
+                    raise Terminated
                 if is_to_be_judged():
                     results = judge(save())
                 elif step % config.save_every == 0:

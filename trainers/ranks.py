@@ -9,6 +9,7 @@ import os
 import sys
 
 import psutil
+import torch
 import torch.distributed as distributed
 from accelerate.commands.config.config_args import default_config_file, load_config_from_file
 from accelerate.commands.launch import launch_command_parser
@@ -62,3 +63,12 @@ def mean_over_ranks(values: Tensor) -> Tensor:
     total = values.clone()
     distributed.all_reduce(total)
     return total / distributed.get_world_size()
+
+
+def on_any_rank(value: bool, device: torch.device) -> bool:
+    """Whether `value` is true on one rank at least; every rank must ask. `device` is one that the ranks can exchange tensors of."""
+    if not (distributed.is_available() and distributed.is_initialized()):
+        return value
+    values = torch.tensor(float(value), device=device)
+    distributed.all_reduce(values, distributed.ReduceOp.MAX)
+    return bool(values.item())

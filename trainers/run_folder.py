@@ -6,16 +6,22 @@ OUTPUT/checkpoints/step-00000500/model.safetensors    weights under their publis
                                  state.json           step, place in the stream, the run's arguments
 OUTPUT/best/                                          the checkpoint that was judged best, of the same files
 
-A folder belongs to one run: `check_output` refuses another one's, so that what `write` removes is always the run's own.
+A folder belongs to one run: `check_output` refuses another one's, and `claimed` one that is still at work, so that what `write` removes is
+always the run's own.
 """
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import math
 import os
 import shutil
-from collections.abc import Callable
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -26,15 +32,19 @@ from torch import nn
 
 from trainers.models import save_checkpoint
 from trainers.models.checkpoint import WEIGHTS_FILE
+from zsdata.launch import launched_as
 
 KEPT_CHECKPOINTS = 3
+LOCK = ".lock"  # in the output; names the process that holds it
+LOCK_SECONDS = 10.0  # the most that a run waits for another one to end, such as one that was killed a moment ago
 HIDDEN = ".unfinished"  # ends the names of folders that are being written or removed; what a killed run leaves of them is no checkpoint
 
 
-def check_output(output: Path, resume: Path | None) -> None:
-    """Refuses an output in which a run would come upon checkpoints other than those that it goes on from.
+def check_output(output: Path, resume: Path | None) -> Path | None:
+    """The checkpoint to go on from; None where the run begins. Refuses an output with checkpoints other than those that it goes on from.
 
-    To be called before anything slow, and before any rank may have written its first checkpoint.
+    A run that is to resume from its own output, in which there is no checkpoint yet, begins: the command that a cluster repeats need not
+    know which time it is. To be called before anything slow, and before any rank may have written its first checkpoint.
 
     Raises:
         FileExistsError: there are such checkpoints; names them and the way out.
@@ -43,10 +53,12 @@ def check_output(output: Path, resume: Path | None) -> None:
     """
     if output.exists() and not output.is_dir():
         raise NotADirectoryError(f"--output {output} is a file; name a folder")
+    if resume is not None and resume.resolve() == output.resolve() and not _whole(output):
+        resume = None
     start = None if resume is None else newest(resume)
     there = [*_whole(output), *([output / "best"] if _is_whole(output / "best") else [])]
     if not there:
-        return
+        return start
     last = max(there, key=_step)
     if start is None:
         raise FileExistsError(
@@ -63,6 +75,38 @@ def check_output(output: Path, resume: Path | None) -> None:
             f"{output} holds a later checkpoint than {start}: {last}, of step {_step(last)}. Give another --output, or move the later ones "
             f"away; --resume {output} goes on from the last one"
         )
+    return start
+
+
+@contextmanager
+def claimed(output: Path) -> Iterator[None]:
+    """Makes the folder, and keeps other runs out of it; on the first rank, for all. On file systems without locks it keeps nobody out.
+
+    Raises:
+        BlockingIOError: another run is at work there; names its process.
+    """
+    output.mkdir(parents=True, exist_ok=True)
+    rank, _ = launched_as()
+    if rank:
+        yield
+        return
+    with (output / LOCK).open("a+") as file:
+        give_up = time.monotonic() + LOCK_SECONDS
+        while not _lock(file.fileno()):
+            if time.monotonic() > give_up:
+                file.seek(0)
+                raise BlockingIOError(
+                    f"another run is at work in {output}, {file.read().strip() or 'of a process that is not known'}: stop it first, or "
+                    "give another --output"
+                )
+            time.sleep(0.1)
+        try:
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {socket.gethostname()}")
+            file.flush()
+            yield
+        finally:
+            fcntl.flock(file, fcntl.LOCK_UN)  # closing is not enough: a process forked meanwhile has the file open too
 
 
 def save(output: Path, step: int, matcher: nn.Module, config: dict[str, Any], training: dict[str, Any], state: dict[str, Any]) -> Path:
@@ -222,6 +266,15 @@ def _replace(folder: Path, fill: Callable[[Path], Any]) -> Path:
     if before is not None:
         shutil.rmtree(before)
     return folder
+
+
+def _lock(descriptor: int) -> bool:
+    """Whether nobody else has the lock; True where there are no locks."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        return error.errno not in (errno.EWOULDBLOCK, errno.EACCES)
+    return True
 
 
 def _hide(folder: Path) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import json
 import multiprocessing
+import multiprocessing.util
 import os
 import pickle
 import select
@@ -14,7 +15,6 @@ import threading
 import time
 import traceback
 import warnings
-import weakref
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -33,6 +33,7 @@ from zsdata.watch import Watch
 LOOK_SECONDS = 1.0  # between two looks at the workers, and at the parent process
 GRACE_SECONDS = 2.0  # for a worker to finish its sample when the pool is closed
 REQUEST_BYTES = 200_000  # the longest message that the socket takes
+_BEFORE_CHILDREN_ARE_AWAITED = 10  # a priority at Python's exit, where multiprocessing waits for processes that it has sent SIGTERM
 _SET_PARENT_DEATH_SIGNAL = 1  # prctl
 _starting = threading.Lock()  # one fork at a time: two would copy each other's half-made channels, and filelock refuses the second one
 
@@ -76,8 +77,9 @@ class WorkerPool:
     """Batches in the order of the requests; process w makes the requests w, w + n, w + 2 n, ...
 
     Each process has a channel of its own, so that one that is killed leaves no lock behind for the others to wait for. Processes end with
-    the pool and with the process that made it, even when that one is killed. Batches are handed over in memory without a name (see
-    `zsdata.parcel`), so that it is of no account how small /dev/shm is.
+    the pool and with the process that made it, even when that one is killed. Where that one handles SIGTERM, as a trainer does that saves
+    its place when a cluster ends it, they leave the signal to it. Batches are handed over in memory without a name (see `zsdata.parcel`),
+    so that it is of no account how small /dev/shm is.
 
     Args:
         requests: taken as far ahead as batches are made ahead.
@@ -105,7 +107,7 @@ class WorkerPool:
         self._start_method = multiprocessing.get_context(context).get_start_method()
         self._taken = 0
         self._members: list[_Member] = []
-        self.close = weakref.finalize(self, _end, self._members, os.getpid())
+        self.close = multiprocessing.util.Finalize(self, _end, (self._members,), exitpriority=_BEFORE_CHILDREN_ARE_AWAITED)
         # Ctrl-C while the processes start is for this one alone. They inherit the mask, and ignore the signal before they lift it.
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
@@ -157,9 +159,10 @@ class WorkerPool:
         # A forked child holds copies of the ends that are not its own; it must not keep them open.
         inherited = [member.channel for member in self._members] + [ours] if context.get_start_method() == "fork" else []
         dies_with_thread = threading.current_thread() is threading.main_thread()
+        at_sigterm = signal.SIG_DFL if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL else signal.SIG_IGN
         process = context.Process(
             target=_work,
-            args=(job, theirs, self._ahead, activity, inherited, dies_with_thread),
+            args=(job, theirs, self._ahead, activity, inherited, dies_with_thread, at_sigterm),
             name=f"zsdata worker {number}",
             daemon=True,
         )
@@ -245,10 +248,8 @@ def _ending(code: int) -> str:
         return f"was killed by signal {-code}"
 
 
-def _end(members: list[_Member], owner: int) -> None:
+def _end(members: list[_Member]) -> None:
     """Ends the processes: gently, then not."""
-    if os.getpid() != owner:  # a forked child that lets go of its copy
-        return
     for member in members:
         try:
             member.channel.shutdown(socket.SHUT_RDWR)
@@ -266,10 +267,18 @@ def _end(members: list[_Member], owner: int) -> None:
     members.clear()
 
 
-def _work(job: Job, channel: socket.socket, ahead: int, activity: Activity, inherited: list[socket.socket], dies_with_thread: bool) -> None:
+def _work(
+    job: Job,
+    channel: socket.socket,
+    ahead: int,
+    activity: Activity,
+    inherited: list[socket.socket],
+    dies_with_thread: bool,
+    at_sigterm: signal.Handlers,
+) -> None:
     """What a process does: until the channel is closed or the parent is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the training process, which ends this one
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # and its handlers are not for a forked child
+    signal.signal(signal.SIGTERM, at_sigterm)  # and its handlers are not for a forked child
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     parent = os.getppid()
     if dies_with_thread:

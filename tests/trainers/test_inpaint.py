@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import torch
 from accelerate import Accelerator, DistributedType
@@ -209,6 +210,26 @@ def test_a_resumed_run_equals_the_unbroken_one(pipeline, photos, things, tmp_pat
     assert any(not torch.equal(before[name], expected[name]) for name in expected)
     for name, weight in expected.items():
         assert torch.equal(found[name], weight), name
+
+
+def test_a_run_that_is_asked_to_end_saves_the_step_it_is_at(pipeline, photos, tmp_path, monkeypatch, capsys):
+    settings, asked = config(steps=5, workers=1, save_every=100), NoisePrediction.loss
+    unbroken = run(pipeline, examples_of(photos=photos), tmp_path / "unbroken", settings)
+
+    def ended_in_step_three(self, model, batch):
+        if batch.requests[0] == (2, 0):
+            for process in (psutil.Process(), *psutil.Process().children()):
+                process.terminate()
+        return asked(self, model, batch)
+
+    with monkeypatch.context() as patch, pytest.raises(SystemExit) as end:
+        patch.setattr(NoisePrediction, "loss", ended_in_step_three)
+        run(pipeline, examples_of(photos=photos), tmp_path / "ended", settings, resume=tmp_path / "ended")
+    assert end.value.code == 143
+    assert f"step-00000003 is saved, and --resume {tmp_path / 'ended'} goes on from it" in capsys.readouterr().out
+    resumed = run(pipeline, examples_of(photos=photos), tmp_path / "ended", settings, resume=tmp_path / "ended")
+    expected, found = weights(unbroken), weights(resumed)
+    assert all(torch.equal(found[name], weight) for name, weight in expected.items())
 
 
 def test_another_run_keeps_its_checkpoints_and_no_photo_is_read(pipeline, photos, tmp_path, monkeypatch):

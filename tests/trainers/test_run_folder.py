@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import re
 import resource
 import shutil
 import signal
+import socket
 import sys
+import threading
 
 import pytest
 import torch
@@ -166,6 +169,50 @@ def test_a_damaged_checkpoint_is_named_file_and_all(tmp_path, file, content):
     (folder / file).write_bytes(content)
     with pytest.raises(ValueError, match=rf"{folder}/{file} is damaged.*resume from another checkpoint"):
         run_folder.load(folder)
+
+
+def hold(output, pipe):
+    with run_folder.claimed(output):
+        pipe.send("held")
+        signal.pause()
+
+
+def test_a_folder_that_a_run_is_at_work_in_is_refused_until_it_ends_however_that_is(tmp_path, monkeypatch):
+    ours, theirs = multiprocessing.Pipe()
+    process = multiprocessing.get_context("fork").Process(target=hold, args=(tmp_path / "run", theirs))
+    process.start()
+    ours.recv()
+    with monkeypatch.context() as patch:
+        patch.setattr(run_folder, "LOCK_SECONDS", 0.2)
+        message = rf"another run is at work in .*run, process {process.pid} on {re.escape(socket.gethostname())}: stop it first"
+        with pytest.raises(BlockingIOError, match=message), run_folder.claimed(tmp_path / "run"):
+            pass
+    threading.Timer(0.3, process.kill).start()
+    with run_folder.claimed(tmp_path / "run"):  # waits for it
+        assert (tmp_path / "run" / ".lock").read_text().startswith(f"process {os.getpid()} on ")
+    process.join()
+    with run_folder.claimed(tmp_path / "run"):
+        pass
+
+
+def test_one_rank_keeps_other_runs_out_for_all(tmp_path, monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with run_folder.claimed(tmp_path):
+        monkeypatch.setenv("RANK", "1")
+        with run_folder.claimed(tmp_path):
+            pass
+
+
+def test_a_run_that_resumes_from_its_own_folder_begins_there_where_there_is_nothing_yet(tmp_path):
+    output = tmp_path / "run"
+    assert run_folder.check_output(output, output) is None
+    output.mkdir()
+    assert run_folder.check_output(output, tmp_path / "other" / ".." / "run") is None
+    with pytest.raises(FileNotFoundError, match="no checkpoint to resume from"):
+        run_folder.check_output(output, tmp_path / "other")
+    assert run_folder.check_output(output, None) is None
+    saved = save(output, 3, 1.0)
+    assert run_folder.check_output(output, output) == saved
 
 
 @pytest.mark.parametrize(("weights", "optimizer"), [(10**6, 1), (1, 10**6)])

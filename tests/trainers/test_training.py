@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -152,6 +153,39 @@ def test_a_resumed_run_equals_the_unbroken_one(tar, tmp_path, accumulate, worker
     AcceleratorState._reset_state(reset_partial_state=True)
     after = run_training(tar, tmp_path / "broken", settings, resume=tmp_path / "broken", loss=recorder(resumed))
     assert broken + resumed == whole
+    for name, weight in unbroken.state_dict().items():
+        assert torch.equal(after.state_dict()[name], weight), name
+
+
+def terminated_at_call(number, loss):
+    """As `loss`, but at its call `number` a cluster takes the machine back: all processes get SIGTERM."""
+    calls = iter(range(number))
+
+    def signalled(initial, sequence, batch):
+        if next(calls, None) is None:
+            psutil.Process().terminate()
+            for child in psutil.Process().children():
+                child.terminate()
+        return loss(initial, sequence, batch)
+
+    return signalled
+
+
+@pytest.mark.parametrize(("accumulate", "workers"), [(1, 2), (2, 0)])
+def test_a_run_that_is_asked_to_end_saves_the_step_it_is_at(tar, tmp_path, capsys, accumulate, workers):
+    whole, ended, resumed = [], [], []
+    settings, output = config(steps=6, accumulate=accumulate, workers=workers, save_every=100), tmp_path / "ended"
+    unbroken = run_training(tar, tmp_path / "unbroken", settings, loss=recorder(whole))
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as end:
+        run_training(tar, output, settings, loss=terminated_at_call(2 * accumulate, recorder(ended)), resume=output)
+    assert end.value.code == 143 and signal.getsignal(signal.SIGTERM) == before
+    said = capsys.readouterr().out
+    assert f"no checkpoint in {output} yet: the run begins" in said
+    assert f"{output / 'checkpoints' / 'step-00000003'} is saved, and --resume {output} goes on from it" in said
+    AcceleratorState._reset_state(reset_partial_state=True)
+    after = run_training(tar, output, settings, resume=output, loss=recorder(resumed))
+    assert ended + resumed == whole and len(ended) == 3 * accumulate
     for name, weight in unbroken.state_dict().items():
         assert torch.equal(after.state_dict()[name], weight), name
 
@@ -592,6 +626,20 @@ def test_a_nan_or_an_explosion_on_one_rank_skips_the_step_on_both(tar, tmp_path)
     weights = [run_folder.load(output / "checkpoints" / f"step-0000000{step}")[0]["weights"] for step in (2, 3, 4)]
     assert all(torch.equal(weights[1][name], value) for name, value in weights[0].items())
     assert any(not torch.equal(weights[2][name], value) for name, value in weights[1].items())
+
+
+def test_ranks_end_with_the_one_that_is_asked_to(tar, tmp_path):
+    output = tmp_path / "run"
+    done = launch(arguments_for(tar, output, "--steps", 9), 2, "tests/trainers/record_samples.py", TORCHRUN, ENDED_RANK="1")
+    assert done.returncode != 0 and done.stdout.count("asked to end by SIGTERM") == 1
+    assert len(read_lines(output / "samples-0.jsonl")) == len(read_lines(output / "samples-1.jsonl")) == 2
+    assert run_folder.newest(output).name == "step-00000002" and run_folder.load(run_folder.newest(output))[1]["stream"]["samples"] == 4
+
+
+def test_a_second_run_keeps_out_of_the_folder_of_one_that_is_at_work(tar, tmp_path, monkeypatch):
+    monkeypatch.setattr(run_folder, "LOCK_SECONDS", 0)
+    with run_folder.claimed(tmp_path), pytest.raises(SystemExit, match=rf"another run is at work in {tmp_path}, process {os.getpid()} on"):
+        run_command(monkeypatch, *arguments_for(tar, tmp_path))
 
 
 def test_the_command_trains_evaluates_and_resumes(tar, tmp_path, monkeypatch):

@@ -1,0 +1,47 @@
+"""SIGTERM, which a cluster sends some seconds before it takes a machine back: the run saves a checkpoint, and ends."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from types import FrameType
+from typing import Any
+
+import torch
+
+from trainers.ranks import on_any_rank
+
+
+class Terminated(SystemExit):
+    """The run was asked to end, and has saved its place. Ends the program with the status of one that the signal killed."""
+
+    def __init__(self) -> None:
+        super().__init__(128 + signal.SIGTERM)
+
+
+class Termination:
+    """While it is entered, SIGTERM only leaves a note: a step is finished first.
+
+    Whoever sends it may send it twice, once to all processes and once through the launcher. Outside of the main thread, where Python
+    lets nobody handle signals, the signal does what it did before.
+    """
+
+    def __init__(self) -> None:
+        self._noted = False
+        self._before: Any = None
+
+    def asked(self, device: torch.device) -> bool:
+        """Whether any rank has got the signal; the same answer on all ranks, which all must ask."""
+        return on_any_rank(self._noted, device)
+
+    def __enter__(self) -> Termination:
+        if threading.current_thread() is threading.main_thread():
+            self._before = signal.signal(signal.SIGTERM, self._note)
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        if self._before is not None:
+            signal.signal(signal.SIGTERM, self._before)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self._noted = True
