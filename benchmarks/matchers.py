@@ -221,6 +221,8 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="OUT", help="write the figures here, too, as they come")
     arguments = parser.parse_args()
     device = torch.device(arguments.device)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        parser.error("torch finds no GPU")
     torch.set_num_threads(arguments.threads)
     defaults = DEFAULTS[device.type]
     given = {name: getattr(arguments, name) for name in Sizes.__dataclass_fields__}

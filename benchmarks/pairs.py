@@ -449,6 +449,8 @@ def main() -> None:
     if min(options.workers) < 1:
         parser.error(f"--workers takes numbers from 1 on; got {options.workers}")
     device = torch.device(options.device)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        parser.error("torch finds no GPU")
     warnings.simplefilter("ignore", BuiltinDepthWarning)
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder, single_thread():

@@ -219,7 +219,7 @@ def test_decompress_makes_shards(run, tmp_path):
     assert run("decompress", tmp_path / "packed.tar.gz", tmp_path / "shards") == (0, f"{tmp_path / 'shards' / 'packed.tar'}\n", "")
     assert (tmp_path / "shards" / "packed.tar").read_bytes() == plain
     status, out, error = run("decompress", tmp_path / "packed.tar.gz", tmp_path / "shards")
-    assert (status, out) == (2, "") and "is there already" in in_words(error)
+    assert (status, out) == (2, "") and "or allow to overwrite (--overwrite)" in in_words(error)
 
 
 @pytest.mark.usefixtures("cheap")

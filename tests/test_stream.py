@@ -431,7 +431,8 @@ def test_problems_of_the_shards_are_said_and_counted(tmp_path, caplog):
     with caplog.at_level(logging.WARNING, logger="zsdata"):
         stream = open_stream(tar)
     assert sum(stream.stats()["shard_problems"].values()) == 1
-    assert "1 faults in the shards" in caplog.text
+    assert "1 fault in the shards (not a JPEG, PNG or WebP: 1)" in caplog.text
+    assert f'the first: {tar} "b": not a JPEG, PNG or WebP: .tif' in caplog.text
 
 
 def test_a_swap_looks_at_the_folder_as_it_is_now(tar, tmp_path):
@@ -475,7 +476,7 @@ def test_problems_of_swapped_shards_are_said_and_counted_too(tar, tmp_path, capl
     with stream.loader(1) as loader:
         with caplog.at_level(logging.WARNING, logger="zsdata"):
             stream.set_sources(other, epoch=1)
-        assert "1 faults in the shards" in caplog.text
+        assert "1 fault in the shards" in caplog.text
         assert sum(stream.stats()["shard_problems"].values()) == sum(loader.stats()["shard_problems"].values()) == 1
 
 

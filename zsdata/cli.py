@@ -9,7 +9,8 @@ import shlex
 import sys
 import warnings
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -330,12 +331,8 @@ def _example(options: argparse.Namespace) -> int:
 
 
 def _pack_and_tell(make_shards: Callable[..., PackReport], options: argparse.Namespace) -> int:
-    try:
+    with _naming_overwrite(options):
         report = make_shards(options.output, overwrite=options.overwrite)
-    except FileExistsError as error:
-        if options.overwrite:
-            raise
-        raise FileExistsError(f"{error} (--overwrite)") from error
     shards = report.shards[0] if len(report.shards) == 1 else f"{len(report.shards):,} shards, {report.shards[0]} to {report.shards[-1]}"
     depths = f" with {_several(report.depth_maps, 'depth map')}" if report.depth_maps else ""
     print(f"packed {_several(report.photos, 'photo')}{depths} ({_megabytes(report.bytes)}) into {_printable(shards)}")
@@ -377,14 +374,26 @@ def _index(options: argparse.Namespace) -> int:
 
 
 def _decompress(options: argparse.Namespace) -> int:
-    for shard in decompress(options.urls, options.output, overwrite=options.overwrite):
+    with _naming_overwrite(options):
+        shards = decompress(options.urls, options.output, overwrite=options.overwrite)
+    for shard in shards:
         print(_printable(shard))
     return OK
 
 
+@contextmanager
+def _naming_overwrite(options: argparse.Namespace) -> Iterator[None]:
+    """What is refused because it is there already names the option that allows it."""
+    try:
+        yield
+    except FileExistsError as error:
+        if options.overwrite:
+            raise
+        raise FileExistsError(f"{error} (--overwrite)") from error
+
+
 def _print_problem(problem: Problem) -> None:
-    where = f"at byte {problem.offset:,}" if problem.key is None else f'"{problem.key}"'
-    Progress.write(_printable(f"{problem.shard} {where}: {problem.reason}"), file=sys.stdout)
+    Progress.write(_printable(str(problem)), file=sys.stdout)
 
 
 def _preview(options: argparse.Namespace) -> int:

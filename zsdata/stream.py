@@ -379,8 +379,9 @@ class ZeroStereoStream(IterableDataset):
         if new:
             reasons = Counter(problem.reason.split(":")[0] for problem in new)
             logger.warning(
-                "%d faults in the shards (%s), the first: %s; `zsdata verify` lists them",
+                "%d fault%s in the shards (%s), the first: %s; `zsdata verify` lists them",
                 len(new),
+                "" if len(new) == 1 else "s",
                 ", ".join(f"{reason}: {count}" for reason, count in reasons.most_common()),
                 new[0],
             )

@@ -77,6 +77,10 @@ class Problem(NamedTuple):
     offset: int
     reason: str
 
+    def __str__(self) -> str:
+        where = f"at byte {self.offset:,}" if self.key is None else f'"{self.key}"'
+        return f"{self.shard} {where}: {self.reason}"
+
 
 def split_name(name: str) -> tuple[str, str] | None:
     """A member's key and lower-case extension by the rule of webdataset: they part at the first dot of the base name.
