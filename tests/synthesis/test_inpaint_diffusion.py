@@ -188,6 +188,16 @@ def test_each_sample_has_noise_of_its_own(inpainter):
     assert (one - other).abs().max() > 1
 
 
+@pytest.mark.parametrize("scheduler", ["lcm", "tcd"])
+def test_noise_that_is_added_on_the_way_is_each_samples_own(folder, scheduler):
+    """Two samples begin with all but the same noise: only what a scheduler adds can make them differ."""
+    inpainter, (right, inpaint_mask), noise = load_inpainter(folder, steps=3, scheduler=scheduler), scenes(1), latent_noise(1)
+    noises = torch.cat([noise, noise + 1e-4])
+    one, other = inpainter.inpaint_from_noise(right.expand(2, -1, -1, -1), inpaint_mask.expand(2, -1, -1, -1), noises)
+    assert (one - other).abs().max() > 1
+    assert torch.equal(inpainter.inpaint_from_noise(right, inpaint_mask, noises[1:])[0], other)
+
+
 @settings(max_examples=50, deadline=None)
 @given(st.data())
 def test_a_cell_is_known_only_if_all_its_pixels_are(data):
