@@ -267,6 +267,19 @@ def test_pairs_that_teach_nothing_are_counted_and_replaced_by_the_same_ones_ever
         assert loader.stats()["rejected"] == {"too many holes": len(refused)}
 
 
+def test_every_sample_of_a_reused_pair_knows_all_that_it_stands_in_for(tmp_path):
+    """Also where its pair is refused on the device, and the samples before it were in another batch."""
+    damaged = {"cut.jpg": jpeg(photo(9))[:2000], "page.jpg": b"<html>not found</html>" * 20}
+    tar = write_tar(tmp_path / "mixed.tar", {f"{i}.jpg": jpeg(photo(i)) for i in range(8)} | damaged)
+    stream = open_stream(tar, depth=CountingDepth(), quality=QualityGate(max_hole_share=0.08), reuse=2, depth_placement="device")
+    plain = list(stream)
+    assert any(len({reason.split(":")[0] for *_, reason in pair.meta["replaced"]}) > 1 for pair in plain)
+    with stream.loader(1, num_workers=0) as loader:
+        assert by_index(batch[0] for batch in loader) == by_index(plain)
+        assert loader.stats()["rejected"] == stream.stats()["rejected"]
+    assert sum(stream.stats()["rejected"].values()) == sum(len(pair.meta["replaced"]) for pair in plain[::2])
+
+
 def test_what_stands_in_for_a_pair_draws_anew(tar):
     """What was refused may be the draw: a disparity that leaves nothing of any photo."""
     drawn = [

@@ -57,8 +57,7 @@ class Synthesis:
         self._last.update({photo: depth for photo, depth in known.items() if photo == drawn[-1].identity})
         pairs = Prepared.stack([made[place] for place in range(len(drawn))])
         meta = [{**pairs.meta[row], "index": sample["index"]} for row, sample in zip(drafts.rows, drafts.meta, strict=True)]
-        rejected = [reject for draft in drawn for reject in draft.rejected]
-        return replace(pairs, meta=meta, rejected=rejected, seconds=drafts.seconds, rows=drafts.rows)
+        return replace(pairs, meta=meta, seconds=drafts.seconds, rows=drafts.rows)
 
     def warm_up(self, photos: Sequence[tuple[int, int]], samples: int) -> Any:
         """Of the depth estimator, which has one, for so many photos at once: of the photo with most pixels, and of the one that is largest

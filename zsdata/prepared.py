@@ -17,8 +17,6 @@ from zsdata.synthesis.indices import count_true
 from zsdata.synthesis.synthesizer import SynthesisConfig, synthesize
 from zsdata.synthesis.view import View
 
-Rejected = tuple[str, str, str, str]  # source, shard, key, reason of a photo that could not be used
-
 
 @dataclass(frozen=True)
 class Prepared:
@@ -37,7 +35,6 @@ class Prepared:
     inpaint: Tensor
     context: dict[str, Tensor]
     meta: Any
-    rejected: list[Rejected] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     rows: list[int] = field(default_factory=list)
 
@@ -81,7 +78,6 @@ class Draft:
     scale: float
     context: dict[str, Tensor]
     meta: Any
-    rejected: list[Rejected] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
@@ -110,7 +106,6 @@ class Drafts:
 
     drafts: list[Draft]
     meta: list[dict[str, Any]]
-    rejected: list[Rejected]
     seconds: dict[str, float]
     rows: list[int]
 
@@ -164,7 +159,6 @@ def make(draft: Draft, depth: DepthMaps, needs: Sequence[str], config: Synthesis
         inpaint=made.inpaint_mask[0].contiguous(),
         context=context,
         meta=meta,
-        rejected=draft.rejected,
         seconds=draft.seconds,
     )
 
@@ -182,6 +176,5 @@ def _together(samples: Sequence[Any]) -> dict[str, Any]:
         meter.add(sample.seconds)
     return {
         "meta": [sample.meta for sample in samples],
-        "rejected": [reject for sample in samples for reject in sample.rejected],
         "seconds": meter.seconds,
     }

@@ -389,7 +389,9 @@ class ZeroStereoStream(IterableDataset):
     def _make(self, epoch: int, index: int) -> StereoBatch:
         prepared = self._worker.prepare(epoch, index)
         self._meter.add(prepared.seconds)
-        self._faults.add(1, prepared.rejected)
+        meta = prepared.meta
+        first = meta["index"] == meta["pair"]  # of the samples that share a pair, and what it stands in for
+        self._faults.add(1, [tuple(reject) for reject in meta["replaced"]] if first else [])
         return self._finish(prepared)
 
     def _finish(self, prepared: Prepared | Draft) -> StereoBatch:

@@ -16,7 +16,7 @@ from torch import Tensor
 from zsdata.faults import BadPhoto, BadShard, NoUsablePhoto
 from zsdata.meter import Meter
 from zsdata.plan import Choice
-from zsdata.prepared import Draft, Prepared, Rejected, make
+from zsdata.prepared import Draft, Prepared, make
 from zsdata.quality import QualityGate
 from zsdata.seeding import rng
 from zsdata.source.depth_map import decode_depth
@@ -34,6 +34,8 @@ from zsdata.synthesis.view import ViewConfig, draw_view, view_photo, whole_view
 
 SHORTEST_SIDE_PX = 32  # a photo with a shorter side shows no scene
 MOST_SPARES = 100  # tried for one sample before the source is called unusable
+
+Rejected = tuple[str, str, str, str]  # source, shard, key, reason of a photo that could not be used
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +102,7 @@ class Worker:
         pair = index - index % self._recipe.reuse
         if self._last_pair is not None and self._last_pair[0] == (sources, epoch, pair):
             made = self._last_pair[1]
-            return replace(made, meta={**made.meta, "index": index}, rejected=[], seconds={})
+            return replace(made, meta={**made.meta, "index": index}, seconds={})
         with single_thread():
             made = self._first_usable(sources, epoch, index, pair)
         if self._recipe.reuse > 1:
@@ -123,11 +125,10 @@ class Worker:
     def instead(self, draft: Draft, reason: str) -> Draft:
         """What stands in for a draft whose pair, made elsewhere, was refused for `reason`; raises as `prepare`."""
         meta = draft.meta
-        refused = (meta["source"], meta["shard"], meta["key"], reason)
+        rejected = [*map(tuple, meta["replaced"]), (meta["source"], meta["shard"], meta["key"], reason)]
+        sources = self._recipe.schedule.at(meta["epoch"])
         with single_thread():
-            made = self._first_usable(
-                self._recipe.schedule.at(meta["epoch"]), meta["epoch"], meta["index"], meta["pair"], [*draft.rejected, refused]
-            )
+            made = self._first_usable(sources, meta["epoch"], meta["index"], meta["pair"], rejected)
         assert isinstance(made, Draft)  # pairs are made elsewhere
         return made
 
@@ -206,7 +207,7 @@ class Worker:
             with meter.stage("prepare"):
                 unseen = self._for_the_device(photo)
         identity = sources.manifests[choice.source].digest, choice.member
-        return Draft(identity, unseen, depth, digest, left, view, scale, context, meta, list(rejected), meter.seconds)
+        return Draft(identity, unseen, depth, digest, left, view, scale, context, meta, meter.seconds)
 
     def _for_the_device(self, photo: _Photo) -> Tensor:
         pixels = _planes(photo.pixels()).unsqueeze(0)
