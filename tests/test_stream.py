@@ -267,6 +267,56 @@ def test_pairs_that_teach_nothing_are_counted_and_replaced_by_the_same_ones_ever
         assert loader.stats()["rejected"] == {"too many holes": len(refused)}
 
 
+def test_the_gate_and_the_figures_of_a_pair_speak_of_its_crop(tar, monkeypatch):
+    asked, refuses = [], QualityGate.refuses
+    monkeypatch.setattr(QualityGate, "refuses", lambda gate, **figures: asked.append(figures) or refuses(gate, **figures))
+    pairs = list(open_stream(tar))
+    assert len(asked) == len(pairs)
+    for pair, figures in zip(pairs, asked, strict=True):
+        assert figures["hole_share"] == pair.meta["hole_share"] == pair.masks.inpaint.double().mean()
+        assert figures["visible_share"] == pair.masks.nonocclusion.double().mean()
+        assert figures["disparity_range_px"] == pair.disparity.max().item() - pair.disparity.min().item()
+        assert pair.meta["largest_disparity_px"] == pair.disparity.max().item()
+        assert figures["drawn_px"] == pytest.approx(pair.meta["disparity_scale"] * 160 * pair.meta["scale_x"])
+
+
+def test_holes_show_another_photo_than_the_pairs_own(tmp_path):
+    """As MfS-Stereo fills them; flat photos tell by their colour which one it is."""
+    tar = write_tar(tmp_path / "flat.tar", {f"{i:02d}.png": png(np.full((120, 160, 3), 20 * i + 10, np.uint8)) for i in range(12)})
+    seen = []
+
+    class Background:
+        needs = ("background",)
+
+        def __call__(self, right, inpaint_mask, generators, background):
+            seen.extend(background.mean((1, 2, 3)).tolist())
+            return background
+
+    everything = QualityGate(max_hole_share=1, min_visible_share=0, min_depth_range=0, min_flip_consistency=0)
+    ramp = lambda images: torch.linspace(0, 1, images.shape[-1]).expand(1, 1, *images.shape[-2:])  # noqa: E731
+    pairs = list(open_stream(tar, depth=ramp, inpaint=Background(), augmentation=AugmentConfig.none(), quality=everything, epoch_size=48))
+    assert len(seen) == len(pairs) and all(20 * int(pair.meta["key"]) + 10 != value for pair, value in zip(pairs, seen, strict=True))
+    assert len(set(seen)) > 6
+
+
+@pytest.mark.parametrize("loaded", [False, True])
+def test_on_a_cpu_holes_are_filled_on_one_thread_and_the_callers_threads_come_back(tar, loaded):
+    """A network's sums depend on how many there are."""
+    seen, threads = set(), torch.get_num_threads()
+
+    def fill(right, inpaint_mask, generators):
+        seen.add(torch.get_num_threads())
+        return grey_fill(right, inpaint_mask, generators)
+
+    stream = open_stream(tar, inpaint=fill)
+    torch.set_num_threads(2)
+    try:
+        list(stream.loader(4, device="cpu") if loaded else stream)
+        assert seen == {1} and torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+
+
 def test_every_sample_of_a_reused_pair_knows_all_that_it_stands_in_for(tmp_path):
     """Also where its pair is refused on the device, and the samples before it were in another batch."""
     damaged = {"cut.jpg": jpeg(photo(9))[:2000], "page.jpg": b"<html>not found</html>" * 20}

@@ -184,6 +184,9 @@ def test_noise_and_timesteps_belong_to_the_example(pipeline, photos):
     noise, timesteps = prediction._draw(ExampleBatch.stack([examples[s, i] for s in range(10) for i in range(4)]))
     alone = prediction._draw(examples[2, 3])
     assert torch.equal(alone[0][0], noise[11]) and alone[1][0] == timesteps[11]
+    prediction._seed = 1
+    other_noise, other_timesteps = prediction._draw(examples[2, 3])
+    assert not torch.equal(other_noise[0], noise[11]) and other_timesteps[0] != timesteps[11], "the seed changes nothing"
     assert len({row.sum().item() for row in noise}) == 40 and len(set(timesteps.tolist())) > 30
     assert 0 <= timesteps.min() < 200 and 800 < timesteps.max() < 1000 and abs(noise.std() - 1) < 0.05
 
