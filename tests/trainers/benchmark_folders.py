@@ -97,9 +97,10 @@ def write_benchmark(name: str, root: Path, variant: str = "") -> dict[str, MadeU
         elif name == "sceneflow":
             pair = made_up_pair(seed, holes=(np.nan, np.inf, 0, -3), largest=300)
             pair.nonoccluded = None
-            things, place = root / "FlyingThings3D", Path("TEST") / "B" / f"000{seed}"
+            part = "AC"[seed]
+            things, place = root / "FlyingThings3D", Path("TEST") / part / f"000{seed}"
             write_image(things / f"frames_{variant}" / place / "left" / "0006.png", pair.left)
             write_image(things / f"frames_{variant}" / place / "right" / "0006.png", pair.right)
             write_pfm(things / "disparity" / place / "left" / "0006.pfm", pair.truth, order=">" if seed else "<")
-            pairs[f"B-000{seed}-0006"] = pair
+            pairs[f"{part}-000{seed}-0006"] = pair
     return pairs

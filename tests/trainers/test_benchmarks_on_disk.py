@@ -54,7 +54,7 @@ def test_sceneflow_may_be_unpacked_without_its_folder(tmp_path):
         ("middlebury", "Q", "trainingQ/second/mask0nocc.png", "disp0GT.pfm,mask0nocc.png"),
         ("eth3d", "", "two_view_training_gt/first/disp0GT.pfm", "two_view_training_gt/SCENE"),
         ("drivingstereo", "F", "rainy/disparity-map-full-size/second.png", "WEATHER"),
-        ("sceneflow", "cleanpass", "FlyingThings3D/disparity/TEST/B/0000/left/0006.pfm", "disparity/TEST"),
+        ("sceneflow", "cleanpass", "FlyingThings3D/disparity/TEST/A/0000/left/0006.pfm", "disparity/TEST"),
     ],
 )
 def test_a_file_that_is_missing_is_named_before_anything_is_read(tmp_path, name, variant, lost, layout):

@@ -58,6 +58,12 @@ def test_a_checkpoint_of_other_options_is_refused_and_changes_nothing(tmp_path):
     assert_same_weights(matcher, before)
 
 
+def test_a_checkpoint_that_holds_more_than_the_matcher_is_refused_in_words(tmp_path):
+    torch.save({**small_matcher().state_dict(), "fnet.attention": torch.zeros(3)}, tmp_path / "more.pth")
+    with pytest.raises(ValueError, match=r"does not fit RAFTStereo .*\(1 left over: fnet.attention\)"):
+        load_checkpoint(small_matcher(), tmp_path / "more.pth")
+
+
 def test_what_is_no_checkpoint_is_named(tmp_path):
     matcher = small_matcher()
     with pytest.raises(FileNotFoundError, match=r"none\.pth"):

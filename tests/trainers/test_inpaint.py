@@ -148,7 +148,7 @@ def test_the_protocol_is_the_papers():
     assert (paper.steps, paper.batch_size, paper.learning_rate) == (50_000, 32, 2e-5)
 
 
-def test_the_unet_is_asked_as_the_inpainter_asks_it(pipeline, photos):
+def test_the_unet_is_asked_as_the_inpainter_asks_it(pipeline, photos, things):
     """At every place where the stream's inpainter and the trainer meet: order of channels, scaling, prompt, and cells that hold a hole."""
     seen = {}
 
@@ -156,8 +156,9 @@ def test_the_unet_is_asked_as_the_inpainter_asks_it(pipeline, photos):
         seen.update(asked=asked, prompt=encoder_hidden_states, timesteps=timesteps)
         return type("Out", (), {"sample": torch.zeros(len(asked), 4, *asked.shape[2:])})
 
-    examples = examples_of(photos=photos)
+    examples = examples_of(photos=photos, things=things)
     batch = ExampleBatch.stack([examples[0, index] for index in range(4)])
+    assert not torch.equal(batch.warped, batch.right.masked_fill(batch.inpaint_mask, 0)), "what the left view shows is not the truth"
     parts = load_diffusion_parts(DiffusionNetwork(str(pipeline)))
     prediction = NoisePrediction(parts, torch.device("cpu"), seed=0)
     loss = prediction.loss(unet, batch)
@@ -331,10 +332,13 @@ def test_what_a_run_cannot_change_on_its_way_is_refused_on_resume(pipeline, phot
         run(pipeline, examples, tmp_path / "run", config(steps=2, ema=0.5), resume=tmp_path / "run")
 
 
-def test_the_average_is_saved_and_the_training_goes_on_with_the_weights_themselves(pipeline, photos, tmp_path):
+def test_the_average_is_saved_and_the_training_goes_on_with_the_weights_themselves(pipeline, photos, tmp_path, monkeypatch):
+    steps, update = [], WeightAverage.update
+    monkeypatch.setattr(WeightAverage, "update", lambda average, unet, step: steps.append(step) or update(average, unet, step))
     saved = run(pipeline, examples_of(photos=photos), tmp_path / "run", config(steps=2, ema=0.5, learning_rate=1e-3))
     training, _ = run_folder.load(saved.parent)
     mean, own, first = weights(saved), training["weights"], weights(pipeline)
+    assert steps == [1, 2]  # the average warms up with them
     name = "conv_in.weight"
     assert not torch.equal(mean[name], own[name]) and not torch.equal(mean[name], first[name])
     network = torch.nn.Linear(1, 1)

@@ -354,6 +354,9 @@ def test_pairs_come_from_tars_as_from_folders(tmp_path):
     assert frame.right_disparity is not None and np.allclose(frame.right_disparity, RIGHT_DISPARITY, rtol=1e-6)
     assert np.allclose(other.disparity, stored / 256) and other.right_disparity is None
     assert pairs.digest != StereoTars(first).digest == StereoTars(str(tmp_path / "a.tar")).digest
+    (tmp_path / "new").mkdir()
+    anew = write_tar(tmp_path / "new" / "b.tar", {"0.LEFT.JPG": jpg(LEFT), "0.right.jpeg": jpg(LEFT), "0.disp.png": png(stored)})
+    assert StereoTars(second).digest != StereoTars(anew).digest, "the same names, other bytes"
 
 
 @pytest.mark.parametrize(("extension", "stored"), [("pfm", pfm), ("npy", npy)])

@@ -11,7 +11,7 @@ import torch
 from tests.hub_cache import COMMITS, run_offline, save_to_hub
 from tests.scenes import jpeg, layered_depth, photo, photo_tar, write_tar
 from trainers.inpaint_data.batches import making, requests
-from trainers.inpaint_data.examples import SYMMETRIC_COLOUR, from_photo, from_stereo, hidden_from_left
+from trainers.inpaint_data.examples import SYMMETRIC_COLOUR, Example, from_photo, from_stereo, hidden_from_left
 from trainers.inpaint_data.sources import ExampleBatch, Examples, PhotoSource, StereoSource
 from trainers.inpaint_data.stored_maps import StereoFrame
 from zsdata import ZeroStereoStream
@@ -203,6 +203,27 @@ def test_a_photo_is_the_truth_of_what_a_left_view_hides(monkeypatch):
     assert 10 < sum(shares) < 30
 
 
+class QuarterOfTheWidth:
+    """How far the nearest point always shifts."""
+
+    def draw_scale(self, generator, width):
+        return 0.25
+
+
+def test_a_soft_edge_of_a_photos_depth_hides_what_a_sharp_one_in_its_middle_hides(monkeypatch):
+    plain(monkeypatch)
+    sharp, soft = torch.zeros(2, 1, 1, 64, 96)
+    sharp[..., 20:40, 30:54] = 1
+    rise = torch.arange(1, 7) / 7
+    soft[..., 20:40, 27:57] = torch.cat([rise, torch.ones(18), rise.flip(0)])
+    for index in range(4):
+        one, other = (
+            from_photo(photo(3, 64, 96), depth, QuarterOfTheWidth(), (64, 96), drawing(index=index)).inpaint_mask[0, 0, 30, :88]
+            for depth in (soft, sharp)
+        )
+        assert torch.equal(one, other) and one.sum() in (20, 21, 24)
+
+
 def a_thing_far_away(width=256):
     """A small thing before a background at infinity: only crops of its rows can show a hole, and few of them do."""
     near = np.zeros((64, width), np.float32)
@@ -293,6 +314,43 @@ def test_an_example_is_a_function_of_seed_step_and_index(tmp_path):
         for epoch in range(2):
             numbers = range(8 * epoch, 8 * epoch + 8)
             assert len({examples[divmod(number, batch_size)].meta[0]["key"] for number in numbers}) == 8
+
+
+def test_every_example_draws_numbers_of_its_own_and_keeps_its_brightness():
+    drawn = []
+
+    class Grey:
+        digest, models = "grey", {}
+
+        def __len__(self):
+            return 3
+
+        def place(self, index):
+            return "somewhere", str(index)
+
+        def make(self, index, size, draw):
+            drawn.append(draw("view").random())
+            image = torch.full((1, 3, *size), 100.7)
+            return Example(image, image, torch.zeros(1, 1, *size, dtype=torch.bool))
+
+    examples = Examples({"grey": Grey()}, (32, 48), 0, 4)
+    made = [examples[divmod(number, 4)] for number in range(24)]
+    assert len(set(drawn)) == 24
+    assert all((image == 101).all() for example in made for image in (example.right, example.warped))
+
+
+def test_a_photos_holes_lie_where_its_depth_and_the_drawn_scale_say(tmp_path):
+    def block(images):
+        depth = torch.zeros_like(images[:, :1])
+        depth[..., 12:36, 56:72] = 1
+        return depth
+
+    tar = photo_tar(tmp_path / "photos.tar", 1, height=48, width=128)
+    source = PhotoSource(build_manifest(tar), block, QuarterOfTheWidth())
+    for index in range(4):
+        inpaint_mask = source.make(0, (48, 128), drawing(index=index)).inpaint_mask
+        hidden = inpaint_mask[0, 0, 24].nonzero().flatten().tolist()
+        assert hidden == list(range(55 + 32, 73 + 32)) and not inpaint_mask[0, 0, 4].any()  # the block, a pixel larger, shifts by 32
 
 
 def test_a_broken_pair_is_replaced_and_told(tmp_path):
