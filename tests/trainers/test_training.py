@@ -28,7 +28,9 @@ from trainers.models.raft_stereo import RAFTStereo
 from trainers.step_guard import MOST_SKIPPED_IN_A_ROW, TrainingDiverged
 from trainers.training_loss import TrainingLoss
 from trainers.validation import EvaluationSet, Validation
+from trainers.weight_average import WeightAverage
 from zsdata import AugmentConfig, StereoBatch, ZeroStereoStream
+from zsdata.metrics import reconstruction_error
 from zsdata.synthesis.backward_warp import backward_warp
 
 pytestmark = pytest.mark.filterwarnings("ignore::zsdata.synthesis.depth.builtin.BuiltinDepthWarning")
@@ -208,6 +210,47 @@ def test_a_resumed_run_whose_steps_have_other_numbers_of_pairs_says_so(tar, tmp_
         assert ("a step was of 2 pairs and is of 1 from here on" in capsys.readouterr().out) == said
 
 
+def test_the_matcher_sees_the_augmented_pair_and_the_log_tells_how_well_the_clean_one_fits(tar, tmp_path, monkeypatch):
+    seen, fits, forward = [], [], RAFTStereo.forward
+    monkeypatch.setattr(loop, "RECONSTRUCT_EVERY_STEPS", 1)
+    monkeypatch.setattr(
+        RAFTStereo, "forward", lambda matcher, *images, **options: seen.extend(images) or forward(matcher, *images, **options)
+    )
+
+    def loss(initial, sequence, batch):
+        assert torch.equal(seen[0], batch.left) and torch.equal(seen[1], batch.right)
+        assert not torch.equal(batch.left, batch.left_clean) and not torch.equal(batch.right, batch.right_clean)
+        fits.append(reconstruction_error(batch.left_clean, batch.right_clean, batch.disparity))
+        return PAPERS_LOSS(initial, sequence, batch)
+
+    run_training(tar, tmp_path, config(steps=1, batch_size=1, iterations=1), loss=loss)
+    (line,) = read_lines(tmp_path / "log.jsonl")
+    for name, errors in fits[0]._asdict().items():
+        assert line[f"reconstruction_{name}"] == pytest.approx(errors.mean().item(), rel=1e-6)
+
+
+def test_gradients_are_clipped_to_the_norm_that_is_asked_for(tar, tmp_path):
+    """Adam takes steps of one length whatever the gradient's, but none where it is far below its epsilon."""
+    torch.manual_seed(0)
+    begin = load_matcher("raft_stereo", **SMALL).state_dict()["cnet.conv1.weight"]
+    for clip_norm, moves in ((1e-20, False), (1.0, True)):
+        after = run_training(tar, tmp_path / str(clip_norm), config(steps=1, batch_size=1, iterations=1, clip_norm=clip_norm)).state_dict()[
+            "cnet.conv1.weight"
+        ]
+        assert ((after - begin).abs().max() > 1e-6) == moves
+
+
+def test_the_schedule_is_that_of_raft_stereo_in_optimizer_steps(tar, tmp_path):
+    """Linear, up in 1 % and down in the rest of 100 steps more than the training has; of AdamW with the weight decay that is asked for."""
+    run_training(tar, tmp_path, config(steps=2, batch_size=1, iterations=1, accumulate=2, weight_decay=3e-4))
+    last, highest, up = 2 + 100 - 1, 2e-4, 0.01 * 102 - 1
+    expected = highest + (highest / 25 / 1e4 - highest) * (2 - up) / (last - up)
+    assert json.loads((tmp_path / "log.jsonl").read_text())["learning_rate"] == pytest.approx(expected, rel=1e-6)
+    training, _ = run_folder.load(run_folder.newest(tmp_path))
+    (group,) = training["optimizer"]["param_groups"]
+    assert group["weight_decay"] == 3e-4 and group["eps"] == 1e-8
+
+
 @pytest.fixture
 def pairs_folder(tmp_path):
     return shifted_pairs(tmp_path / "pairs")
@@ -225,10 +268,12 @@ def nan_in_step(number, loss):
     return sometimes
 
 
-def test_the_average_the_best_and_the_skipped_steps_come_back_on_resume(tar, tmp_path, pairs_folder):
+def test_the_average_the_best_and_the_skipped_steps_come_back_on_resume(tar, tmp_path, pairs_folder, monkeypatch):
     settings = config(steps=7, ema=0.9, save_every=3, evaluate_first=True, evaluate_every=2, evaluation_iterations=2, best_by="epe")
-    sets = [EvaluationSet.parse(str(pairs_folder))]
+    sets, averaged, update = [EvaluationSet.parse(str(pairs_folder))], [], WeightAverage.update
+    monkeypatch.setattr(WeightAverage, "update", lambda average, network, step: averaged.append(step) or update(average, network, step))
     run_training(tar, tmp_path / "unbroken", settings, loss=nan_in_step(4, PAPERS_LOSS), sets=sets)
+    assert averaged == [1, 2, 3, 5, 6, 7], "not the step that was skipped"
     loss = nan_in_step(4, PAPERS_LOSS)
     with pytest.raises(RuntimeError, match="power cut"):
         run_training(tar, tmp_path / "broken", settings, loss=fails_at_call(5, loss), sets=sets)
@@ -259,6 +304,9 @@ def test_the_average_the_best_and_the_skipped_steps_come_back_on_resume(tar, tmp
     assert [one["name"] for one in scores] == ["far", "near"]
     expected_scores = json.loads((tmp_path / "unbroken" / "evaluation.json").read_text())["sets"]["pairs"]["pairs"]
     assert [one["all"] for one in scores] == [one["all"] for one in expected_scores]
+    saved = partial(load_trained(expected, "raft_stereo").predict, iterations=2)
+    assert [one["all"] for one in evaluate(saved, sets[0].pairs()[0])] == [one["all"] for one in scores], "the average is judged"
+    assert [line["step"] for line in read_lines(tmp_path / "resumed" / "evaluations.jsonl")] == [6, 7], "4 was judged before"
 
 
 def power_cut_at_call(number, function):
@@ -332,10 +380,17 @@ def test_the_rates_in_the_log_leave_out_what_evaluations_and_checkpoints_take(ta
     monkeypatch.setattr(loop, "LOG_EVERY_STEPS", 2)
     monkeypatch.setattr(Validation, "judge", takes(1000, Validation.judge))
     monkeypatch.setattr(run_folder, "save", takes(100, run_folder.save))
-    settings = config(steps=8, save_every=2, evaluate_every=3, evaluate_first=True, evaluation_iterations=1)
+    settings = config(steps=6, accumulate=2, save_every=2, evaluate_every=3, evaluate_first=True, evaluation_iterations=1)
     run_training(tar, tmp_path / "run", settings, loss=takes(0.5, PAPERS_LOSS), sets=[EvaluationSet.parse(str(pairs_folder))])
     rates = [line["pairs_per_second"] for line in read_lines(tmp_path / "run" / "log.jsonl")]
-    assert rates == [settings.batch_size / 0.5] * 4
+    assert rates == [settings.batch_size / 0.5] * 3
+
+
+def test_the_share_of_waiting_is_that_of_the_time_since_the_last_line(monkeypatch):
+    clock = iter([100.0, 104.0])
+    monkeypatch.setattr(loop, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    before, here = loop._Mark(step=10, wait_seconds=50.0), loop._Mark(step=20, wait_seconds=51.0)
+    assert before.rates(80, here) == {"pairs_per_second": 20.0, "wait_share": 0.25}
 
 
 def test_the_best_of_another_folder_or_of_the_checkpoint_itself_is_restored(tar, tmp_path, pairs_folder):

@@ -118,6 +118,14 @@ def test_a_rank_reads_no_pair_but_those_that_it_judges(tmp_path, monkeypatch):
     assert [len(list(EvaluationSet.parse("motorcycle").pairs(rank=rank, world_size=2)[0])) for rank in (0, 1)] == [1, 0]
 
 
+def test_scene_flow_is_judged_below_192_px_too_as_published(tmp_path, monkeypatch):
+    write_benchmark("sceneflow", tmp_path, "finalpass")
+    monkeypatch.setattr("trainers.validation.gather_object", lambda mine: mine)
+    one = EvaluationSet.parse(f"sceneflow={tmp_path}")
+    scores = Validation([one]).judge(lambda left, _: left[:, :1], device=torch.device("cpu"), rank=0, world_size=1)["sceneflow"]
+    assert all(0 < score["all_below_192"]["pixels"] < score["all"]["pixels"] for score in scores) and len(scores) == 2
+
+
 def test_two_sets_of_one_name_and_an_unknown_measure_are_refused(tmp_path):
     one = EvaluationSet("pairs", "folder", tmp_path)
     with pytest.raises(ValueError, match="one name: pairs, pairs"):
