@@ -352,6 +352,17 @@ def test_the_average_is_saved_and_the_training_goes_on_with_the_weights_themselv
     assert torch.allclose(average.weights[0], begin + 1 - 0.9 * 2 / 11)
 
 
+def test_the_average_stands_in_for_the_weights_and_goes_again():
+    network = torch.nn.Linear(3, 2)
+    average = WeightAverage(network, 0.9)
+    begin = network.weight.detach().clone()
+    with torch.no_grad():
+        network.weight += 1
+    with weights_of(average, network) as own:
+        assert torch.equal(network.weight, begin) and torch.equal(own["weight"], begin + 1)
+    assert torch.equal(network.weight, begin + 1)
+
+
 def test_the_weights_wait_on_the_cpu_while_the_average_stands_in_for_them():
     """The meta device stands for a GPU here: a copy on it is made without a word, one to the CPU cannot be."""
     network = torch.nn.Linear(3, 2, device="meta")

@@ -162,6 +162,25 @@ def test_the_checkpoint_that_was_just_written_is_never_the_one_that_is_removed(t
     assert len(list((tmp_path / "checkpoints").iterdir())) == run_folder.KEPT_CHECKPOINTS
 
 
+def test_the_best_comes_along_into_another_folder_when_its_checkpoint_is_gone(tmp_path):
+    run, new = tmp_path / "run", tmp_path / "new"
+    run_folder.keep_best(save(run, 1, 1.0), run)
+    for step in range(2, 2 + run_folder.KEPT_CHECKPOINTS):
+        last = save(run, step, float(step))
+    assert not run_folder.folder_of(run, 1).exists()
+    assert run_folder.restore_best(last, new, 1) and value_of(new / "best") == 1.0
+
+
+@pytest.mark.parametrize(("begun", "now"), [({"loss": "zero"}, {}), ({}, {"loss": "zero"}), ({"loss": "zero"}, {"loss": "l1"})])
+def test_an_option_that_one_run_alone_has_is_another_option(tmp_path, begun, now):
+    state = {"options": {"model": "raft_stereo", **begun}}
+    run_folder.require_options(tmp_path, state, {"model": "raft_stereo", **begun}, "--initial-weights W")
+    with pytest.raises(
+        ValueError, match=rf"with loss {begun.get('loss')}, this one has {now.get('loss')}; .*new run with --initial-weights W"
+    ):
+        run_folder.require_options(tmp_path, state, {"model": "raft_stereo", **now}, "--initial-weights W")
+
+
 @pytest.mark.parametrize("file", ["training.pt", "state.json"])
 @pytest.mark.parametrize("content", [b"", b"{", b"PK\x03\x04 cut off"])
 def test_a_damaged_checkpoint_is_named_file_and_all(tmp_path, file, content):

@@ -8,7 +8,7 @@ from accelerate import Accelerator
 from accelerate.state import AcceleratorState
 from torch import nn
 
-from trainers.step_guard import EXPLOSION, FEWEST_STEPS, StepGuard
+from trainers.step_guard import EXPLOSION, FEWEST_STEPS, StepGuard, TrainingDiverged
 from zsdata import Masks, StereoBatch
 
 NORM = torch.tensor(1.0)
@@ -59,6 +59,21 @@ def test_only_the_batch_with_the_bad_loss_is_blamed(tmp_path):
     assert guard.refuses(0, torch.tensor(float("nan")))
     (line,) = [json.loads(line) for line in (tmp_path / "skipped.jsonl").read_text().splitlines()]
     assert line["samples"][0]["index"] == 1
+
+
+def test_eight_skipped_steps_are_an_error_if_they_are_in_a_row_across_a_resume_too(tmp_path):
+    accelerator = Accelerator(cpu=True)
+    guard = StepGuard(accelerator, nn.Linear(1, 1), tmp_path / "skipped.jsonl")
+    for step in range(7):
+        assert take(guard, step, float("nan"))
+    assert not take(guard, 7, 1.0)
+    for step in range(8, 15):
+        assert take(guard, step, float("nan"))
+    resumed = StepGuard(accelerator, nn.Linear(1, 1), tmp_path / "skipped.jsonl")
+    resumed.load_state_dict(json.loads(json.dumps(guard.state_dict())))
+    with pytest.raises(TrainingDiverged, match="in each of the last 8 steps"):
+        take(resumed, 15, float("nan"))
+    assert resumed.skipped == 15
 
 
 def test_the_statistics_of_batch_norms_are_set_back(tmp_path):

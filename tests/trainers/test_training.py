@@ -20,6 +20,7 @@ from safetensors.torch import load_file
 
 from tests.scenes import grey_fill, layered_depth, photo_tar, shifted_pairs
 from trainers import igev, loop, raft, run_folder
+from trainers.accelerated import load_optimizer_state, optimizer_state
 from trainers.arguments import add_training_arguments, leave_black, open_stream, run
 from trainers.evaluate import evaluate
 from trainers.loop import TrainConfig, train
@@ -779,6 +780,27 @@ def test_each_loss_of_the_ablations_is_what_it_says(tar):
     terms = {name: TrainingLoss(name=name)(None, sequence, batch)[1] for name in ("zero", "l1", "l1+lp")}
     assert len({float(metrics["disparity_term"]) for metrics in terms.values()}) == 1
     assert terms["l1"]["photometric_term"] == 0 < terms["zero"]["photometric_term"] < terms["l1+lp"]["photometric_term"]
+
+
+def test_labels_beyond_the_largest_supervised_disparity_teach_nothing(tar):
+    batch = StereoBatch.stack([small_stream(tar).replay(0, index) for index in range(2)])
+    limit = batch.disparity.median().item()
+    masks = batch.masks._replace(valid=batch.masks.valid & (batch.disparity < limit))
+    sequence = [batch.disparity * 1.5 + 1]
+    limited, _ = TrainingLoss(name="l1", max_disparity=limit)(None, sequence, batch)
+    expected, _ = TrainingLoss(name="l1")(None, sequence, replace(batch, masks=masks))
+    assert limited == expected != TrainingLoss(name="l1")(None, sequence, batch)[0]
+
+
+def test_the_scale_of_half_precision_gradients_comes_back_on_resume():
+    def parts(scale):
+        optimizer = torch.optim.SGD(torch.nn.Linear(1, 1).parameters(), lr=1.0)
+        schedule = torch.optim.lr_scheduler.ConstantLR(optimizer)
+        return optimizer, schedule, SimpleNamespace(scaler=torch.amp.GradScaler("cpu", init_scale=scale))
+
+    saved, resumed = parts(8.0), parts(65536.0)
+    load_optimizer_state(optimizer_state(*saved), *resumed)
+    assert resumed[-1].scaler.get_scale() == 8.0
 
 
 def test_where_every_label_is_trusted_no_photometric_term_is_computed(tar, monkeypatch):
