@@ -1,12 +1,14 @@
 import argparse
+from typing import Any
 
 import pytest
 
 from tests.scenes import photo_tar
 from tests.small_depth_networks import save_small_network
 from tests.small_pipeline import save_small_pipeline
-from trainers.arguments import add_training_arguments, labels_are_trusted, open_stream
-from zsdata import DepthNetwork, DiffusionNetwork, ZeroStereoStream
+from trainers.arguments import add_training_arguments, labels_are_trusted, leave_black, open_stream, train_config
+from trainers.loop import TrainConfig
+from zsdata import AdaptiveDisparity, AugmentConfig, DepthNetwork, DiffusionNetwork, UniformDisparity, ZeroStereoStream
 
 diffusers = pytest.importorskip("diffusers")
 
@@ -31,6 +33,43 @@ def test_the_streams_options_reach_the_stream(tar, tmp_path):
     assert len(named) == 8 and named.state_dict() != stream.state_dict()
     cached = open_stream(parsed("--sources", tar, "--depth-cache", str(tmp_path / "depth")))
     assert len(cached) == 3 and (tmp_path / "depth").is_dir()
+
+
+def test_every_option_of_the_stream_is_handed_on(monkeypatch):
+    monkeypatch.setattr("trainers.arguments.ZeroStereoStream", lambda schedule, **options: {"schedule": schedule, **options})
+    words = "--sources a.tar --sources-from 5 b.tar --seed 7 --depth-placement device --commercial-safe --no-confidence --no-augmentation"
+    told: Any = open_stream(parsed(*words.split(), "--disparity", "uniform", "--inpaint", "none"))
+    assert told["schedule"].keys() == {0, 5} and told["seed"] == 7 and told["depth_placement"] == "device" and told["commercial_safe"]
+    assert not told["synthesis"].flip_confidence and told["augmentation"] == AugmentConfig.none()
+    assert told["disparity"] == UniformDisparity() and told["inpaint"] is leave_black
+    plain: Any = open_stream(parsed("--sources", "a.tar"))
+    assert plain["synthesis"].flip_confidence and plain["augmentation"] == AugmentConfig() and plain["disparity"] == AdaptiveDisparity()
+    assert not plain["commercial_safe"] and plain["inpaint"] == "builtin"
+
+
+def test_every_option_of_the_training_is_handed_on():
+    words = "--sources a.tar --steps 11 --batch-size 12 --iterations 13 --evaluation-iterations 14 --learning-rate 0.15 --accumulate 16"
+    more = "--workers 17 --mixed-precision bf16 --compile --channels-last --ema 0.18 --save-every 19 --evaluate-every 20 --evaluate-first"
+    told = train_config(parsed(*words.split(), *more.split(), "--best-by", "d1", "--seed", "21"))
+    assert told == TrainConfig(
+        steps=11,
+        batch_size=12,
+        iterations=13,
+        evaluation_iterations=14,
+        learning_rate=0.15,
+        accumulate=16,
+        workers=17,
+        mixed_precision="bf16",
+        compile=True,
+        channels_last=True,
+        ema=0.18,
+        save_every=19,
+        evaluate_every=20,
+        evaluate_first=True,
+        best_by="d1",
+        seed=21,
+    )
+    assert train_config(parsed("--sources", "a.tar")) == TrainConfig(), "the defaults are the paper's"
 
 
 def test_labels_are_trusted_where_nothing_tells_their_confidence():

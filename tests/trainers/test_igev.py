@@ -65,6 +65,14 @@ def test_the_backbone_starts_from_the_given_weights(command, tmp_path):
         torch.testing.assert_close(state[name], torch.full_like(state[name], 0.5))
 
 
+@pytest.mark.parametrize(("words", "limit"), [((), 192), (("--max-supervised-disparity", 700), 700)])
+def test_the_limit_of_the_labels_reaches_the_loss(command, monkeypatch, words, limit):
+    told = []
+    monkeypatch.setattr(igev, "train_as_told", lambda arguments, matcher, loss, name, options: told.append(loss))
+    command(*words)
+    assert told == [TrainingLoss(max_disparity=limit)]
+
+
 @pytest.mark.parametrize(("max_disparity", "supervised"), [(192, 0.5), (700, 1.0)])
 def test_labels_beyond_the_limit_supervise_neither_the_initial_nor_the_updated_prediction(max_disparity, supervised):
     label = torch.full((1, 1, 8, 8), 100.0)

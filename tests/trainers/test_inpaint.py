@@ -28,7 +28,7 @@ from trainers.inpaint_data.sources import ExampleBatch, Examples, PhotoSource, S
 from trainers.inpaint_loop import TuneConfig, tune
 from trainers.noise_prediction import NoisePrediction
 from trainers.pairs_on_disk import StereoPair
-from trainers.pipeline_folder import local_pipeline
+from trainers.pipeline_folder import frozen_digest, local_pipeline
 from trainers.step_guard import MOST_SKIPPED_IN_A_ROW, TrainingDiverged
 from trainers.weight_average import WeightAverage, weights_of
 from zsdata import AdaptiveDisparity, ZeroStereoStream, load_inpainter
@@ -330,6 +330,16 @@ def test_what_a_run_cannot_change_on_its_way_is_refused_on_resume(pipeline, phot
     run(first / "pipeline", examples, tmp_path / "new", config(steps=2, ema=0.5), resume=first)  # the same frozen parts
     with pytest.raises(ValueError, match="has all of the 2 steps already"):
         run(pipeline, examples, tmp_path / "run", config(steps=2, ema=0.5), resume=tmp_path / "run")
+
+
+def test_the_digest_of_a_pipeline_is_that_of_all_that_is_not_tuned(pipeline, tmp_path):
+    files = ("vae/config.json", "text_encoder/model.safetensors", "tokenizer/merges.txt", "scheduler/scheduler_config.json")
+    digests = {frozen_digest(pipeline)}
+    for number, file in enumerate((*files, "unet/config.json", "README.md")):
+        changed = shutil.copytree(pipeline, tmp_path / str(number))
+        (changed / file).write_bytes((changed / file).read_bytes()[:-1] + b" ")
+        digests.add(frozen_digest(changed))
+    assert len(digests) == 1 + len(files)
 
 
 def test_the_average_is_saved_and_the_training_goes_on_with_the_weights_themselves(pipeline, photos, tmp_path, monkeypatch):

@@ -24,7 +24,7 @@ from trainers.accelerated import load_optimizer_state, optimizer_state
 from trainers.arguments import add_training_arguments, leave_black, open_stream, run
 from trainers.evaluate import evaluate
 from trainers.loop import TrainConfig, train
-from trainers.models import load_matcher, load_trained
+from trainers.models import load_matcher, load_trained, save_checkpoint
 from trainers.models.raft_stereo import RAFTStereo
 from trainers.step_guard import MOST_SKIPPED_IN_A_ROW, TrainingDiverged
 from trainers.training_loss import TrainingLoss
@@ -739,6 +739,31 @@ def test_a_wrong_argument_ends_the_program_without_a_traceback(tmp_path):
     assert done.returncode != 0 and "nowhere.tar" in done.stderr and "Traceback" not in done.stderr
 
 
+IGEV_ARGUMENTS = "--hidden-dims 16 16 16 --corr-radius 2 --max-disp 32 --n-gru-layers 2".split()
+
+
+@pytest.mark.parametrize(("trainer", "small"), [(raft, SMALL_ARGUMENTS), (igev, IGEV_ARGUMENTS)], ids=["raft", "igev"])
+def test_a_training_begins_with_the_weights_that_are_given_or_with_those_of_its_seed(tmp_path, monkeypatch, trainer, small):
+    begun = []
+    monkeypatch.setattr("trainers.arguments.train", lambda matcher, *others, **options: begun.append(matcher))
+    monkeypatch.setattr("trainers.arguments.open_stream", lambda arguments: None)
+
+    def weights_of_a_run(*words):
+        torch.manual_seed(123)  # whatever was drawn before
+        run_command(monkeypatch, "--sources", "a.tar", "--output", tmp_path / "run", *small, *words, trainer=trainer)
+        assert begun[-1].batch_norm_frozen
+        return begun[-1].state_dict()
+
+    def equal(one, other):
+        return all(torch.equal(value, other[name]) for name, value in one.items())
+
+    first, second = weights_of_a_run("--seed", 1), weights_of_a_run("--seed", 2)
+    assert equal(weights_of_a_run("--seed", 1), first) and not equal(first, second)
+    save_checkpoint(begun[0], tmp_path / "model.safetensors")
+    for path in (tmp_path, tmp_path / "model.safetensors"):
+        assert equal(weights_of_a_run("--seed", 2, "--initial-weights", path), first)
+
+
 @pytest.mark.parametrize(("cause", "words"), [(OSError("no such model"), True), (KeyError("a bug"), False)])
 def test_a_model_that_cannot_be_loaded_is_one_line_and_a_bug_is_a_traceback(monkeypatch, cause, words):
     def main():
@@ -780,16 +805,6 @@ def test_each_loss_of_the_ablations_is_what_it_says(tar):
     terms = {name: TrainingLoss(name=name)(None, sequence, batch)[1] for name in ("zero", "l1", "l1+lp")}
     assert len({float(metrics["disparity_term"]) for metrics in terms.values()}) == 1
     assert terms["l1"]["photometric_term"] == 0 < terms["zero"]["photometric_term"] < terms["l1+lp"]["photometric_term"]
-
-
-def test_labels_beyond_the_largest_supervised_disparity_teach_nothing(tar):
-    batch = StereoBatch.stack([small_stream(tar).replay(0, index) for index in range(2)])
-    limit = batch.disparity.median().item()
-    masks = batch.masks._replace(valid=batch.masks.valid & (batch.disparity < limit))
-    sequence = [batch.disparity * 1.5 + 1]
-    limited, _ = TrainingLoss(name="l1", max_disparity=limit)(None, sequence, batch)
-    expected, _ = TrainingLoss(name="l1")(None, sequence, replace(batch, masks=masks))
-    assert limited == expected != TrainingLoss(name="l1")(None, sequence, batch)[0]
 
 
 def test_the_scale_of_half_precision_gradients_comes_back_on_resume():
