@@ -773,6 +773,40 @@ def test_a_wrong_argument_is_one_line_in_words(monkeypatch, capsys, tmp_path, ch
     assert message in str(end.value)
 
 
+@pytest.mark.filterwarnings("ignore:The built-in depth")
+def test_every_option_of_the_command_is_handed_on(pipeline, photos, things, tmp_path, monkeypatch):
+    told = {}
+    monkeypatch.setattr(inpaint, "tune", lambda pipeline, examples, config, **options: told.update(locals()))
+    words = "--steps 11 --batch-size 12 --micro-batch 3 --learning-rate 0.14 --ema 0.15 --gradient-checkpointing --mixed-precision bf16"
+    more = (
+        "--workers 17 --save-every 18 --validation-steps 19 --seed 20 --size 32 48 --validate motorcycle --tracker none --subfolder inner"
+    )
+    folder = shutil.copytree(pipeline, tmp_path / "all" / "inner").parent
+    given = ["--pipeline", folder, "--photos", photos, "--datasets", f"sceneflow-clean={things}", "--output", tmp_path / "run"]
+    monkeypatch.setattr(sys, "argv", ["inpaint.py", *map(str, given), *words.split(), *more.split()])
+    inpaint.main()
+    assert told["config"] == TuneConfig(
+        steps=11,
+        batch_size=12,
+        micro_batch=3,
+        learning_rate=0.14,
+        ema=0.15,
+        gradient_checkpointing=True,
+        mixed_precision="bf16",
+        workers=17,
+        save_every=18,
+        validation_steps=19,
+        seed=20,
+    )
+    options, examples = told["options"], told["examples"]
+    assert told["pipeline"] == folder and options["subfolder"] == "inner" and options["output"] == tmp_path / "run"
+    assert options["resume"] is None and options["tracker"] is None and [pair.name for pair in options["pairs"]] == ["motorcycle"]
+    assert len(examples) == 6 + 4 and examples.size == (32, 48)
+    both = {"photos": PhotoSource(build_manifest(photos), "builtin", AdaptiveDisparity())}
+    both = {"sceneflow-clean": StereoSource(StereoFolder("sceneflow-clean", things)), **both}
+    assert examples.position(5) == Examples(both, (32, 48), 20, 12).position(5)
+
+
 def test_help_names_every_data_set_and_the_tar_layout(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["inpaint.py", "--help"])
     with pytest.raises(SystemExit):
