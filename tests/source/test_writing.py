@@ -3,6 +3,7 @@
 import gzip
 import os
 import resource
+from contextlib import contextmanager
 
 import pytest
 
@@ -14,13 +15,15 @@ from .images import encode, picture
 from .test_tar import write_tar
 
 
-@pytest.fixture
+@contextmanager
 def small_disk():
-    """No file can grow beyond 4 KiB: refused as on a full disk."""
+    """No file can grow beyond 4 KiB: refused as on a full disk. Nor can that which pytest prints to: nothing else belongs inside."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 @pytest.fixture
@@ -39,9 +42,9 @@ def photos(tmp_path):
         (lambda folder: write_whole(folder / "out" / "left.jpg", bytes(9000)), "left.jpg"),
     ],
 )
-def test_a_file_that_the_disk_has_no_room_for_is_named_and_removed(photos, small_disk, tmp_path, write, name):
+def test_a_file_that_the_disk_has_no_room_for_is_named_and_removed(photos, tmp_path, write, name):
     (tmp_path / "out").mkdir()
-    with pytest.raises(OSError, match="too large") as raised:
+    with pytest.raises(OSError, match="too large") as raised, small_disk():
         write(tmp_path)
     assert name in str(raised.value.filename)
     assert list((tmp_path / "out").iterdir()) == []
