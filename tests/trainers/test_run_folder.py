@@ -239,6 +239,7 @@ def test_a_disk_that_is_full_is_an_error_that_names_the_checkpoint_and_the_room_
     first = save(tmp_path, 1, 1.0)
 
     def fill_the_disk():
+        torch.set_num_threads(1)  # a forked process has not the others
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (10**6, 10**6))
         with pytest.raises(OSError, match=r"step-00000002 could not be written, with [\d,]+ MB free on its disk: .*--resume"):
