@@ -41,9 +41,11 @@ class PackReport:
     @property
     def passed_over_in_words(self) -> str:
         """The most frequent of them first, as in "passed over by their names: 12 with .txt, 1 with no extension"; empty without any."""
-        kinds = [f"{count:,} with {extension}" for extension, count in self.passed_over.most_common(EXTENSIONS_SHOWN)]
-        more = self.passed_over.total() - sum(count for _, count in self.passed_over.most_common(EXTENSIONS_SHOWN))
-        return "passed over by their names: " + ", ".join(kinds + [f"{more:,} more"] * bool(more)) if kinds else ""
+        shown = self.passed_over.most_common(EXTENSIONS_SHOWN)
+        kinds = [f"{count:,} with {extension}" for extension, count in shown]
+        if len(shown) < len(self.passed_over):
+            kinds.append(f"{self.passed_over.total() - sum(count for _, count in shown):,} more")
+        return f"passed over by their names: {', '.join(kinds)}" if kinds else ""
 
 
 def pack(
@@ -105,9 +107,9 @@ def pack(
             report.photos += 1
         report.skipped += depths.left()
         if not report.photos:
-            reasons = [f"{path}: {reason}" for path, reason in report.skipped[:3]] + [report.passed_over_in_words] * bool(
-                report.passed_over
-            )
+            reasons = [f"{path}: {reason}" for path, reason in report.skipped[:3]]
+            if report.passed_over:
+                reasons.append(report.passed_over_in_words)
             raise ValueError("; ".join([f"no photo to pack in {source}: a photo is a JPEG, PNG or WebP file", *reasons]))
         report.shards = [os.fspath(path) for path in shards.publish()]
     report.bytes = sum(os.path.getsize(path) for path in report.shards)
