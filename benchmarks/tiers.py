@@ -110,9 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     device = torch.device(options.device)
     options.micro_batch = options.micro_batch or (1 if device.type == "cpu" else 8)
     options.repeats = options.repeats or (3 if device.type == "cpu" else 5)
-    for library in (diffusers, transformers):
-        library.logging.set_verbosity_error()  # what they say of made-up configurations
-        library.logging.disable_progress_bar()
+    quiet()
     cpu = f"{platform.processor() or platform.machine()}, {torch.get_num_threads()} threads"
     name = cpu if device.type == "cpu" else torch.cuda.get_device_name(device)
     dtype = choose_dtype(options.dtype, device)
@@ -139,6 +137,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 indent=2,
             )
         )
+
+
+def quiet() -> None:
+    for library in (diffusers, transformers):
+        library.logging.set_verbosity_error()  # what they say of made-up configurations
+        library.logging.disable_progress_bar()
 
 
 def matmul_tflops(device: torch.device, dtype: torch.dtype, options: argparse.Namespace) -> float:
