@@ -408,7 +408,7 @@ def test_a_lost_worker_and_memory_that_ran_out_are_told_in_words(run, tmp_path, 
 @pytest.mark.parametrize(
     ("cause", "told"),
     [
-        (OSError(errno.ENOSPC, "No space left on device"), "failed: [Errno 28] No space left on device"),
+        (OSError(errno.ENOSPC, "No space left on device"), "failed: No space left on device"),
         (ValueError("no such depth"), "failed: no such depth"),
         (MemoryError(), "failed: memory ran out; fewer workers"),
     ],

@@ -21,7 +21,7 @@ from trainers.step_guard import TrainingDiverged
 from trainers.training_loss import LOSSES
 from trainers.validation import EvaluationSet
 from zsdata import AdaptiveDisparity, AugmentConfig, DepthNetwork, DiffusionNetwork, SynthesisConfig, UniformDisparity, ZeroStereoStream
-from zsdata.faults import NoUsablePhoto, TooManyFaults, WorkerLost
+from zsdata.faults import TOLD_IN_WORDS, in_words
 from zsdata.sources import parse_sources
 from zsdata.stream import DEPTH_PLACEMENTS
 
@@ -330,11 +330,7 @@ def run(main: Any) -> None:
     try:
         start_missing_ranks()
         main()
-    except (ValueError, ImportError, OSError, MemoryError, NoUsablePhoto, TooManyFaults, TrainingDiverged, WorkerLost) as error:
-        sys.exit(f"{Path(sys.argv[0]).name}: {error}")
-    except RuntimeError as error:
-        if not isinstance(error.__cause__, (ImportError, OSError, MemoryError)):  # a sample failed for want of a file, package or memory
-            raise
-        sys.exit(f"{Path(sys.argv[0]).name}: {error}")
+    except (*TOLD_IN_WORDS, TrainingDiverged) as error:
+        sys.exit(f"{Path(sys.argv[0]).name}: {in_words(error)}")
     except KeyboardInterrupt:
         sys.exit(130)

@@ -1,7 +1,7 @@
 """zsdata: single photographs in, an endless, reproducible stream of stereo training pairs out."""
 
 from zsdata.augment import AugmentConfig
-from zsdata.faults import BadPhoto, BadShard, FailureBudget, NoUsablePhoto, TooManyFaults, WorkerLost
+from zsdata.faults import BadPhoto, BadShard, FailureBudget, NoUsablePhoto, SampleFailed, TooManyFaults, WorkerLost
 from zsdata.licences import NonCommercialModel
 from zsdata.loader import StereoLoader
 from zsdata.losses import zero_stereo_loss
@@ -35,6 +35,7 @@ __all__ = [
     "NoUsablePhoto",
     "NonCommercialModel",
     "QualityGate",
+    "SampleFailed",
     "StereoBatch",
     "StereoLoader",
     "SynthesisConfig",

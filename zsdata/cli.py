@@ -24,7 +24,7 @@ from zsdata.augment import AugmentConfig
 from zsdata.bench import REST, BenchReport, advice, bench, fill_depth_cache, leave_holes, samples_needed
 from zsdata.example_photos import EXAMPLE_PHOTOS, pack_example_photos
 from zsdata.export import export_pairs
-from zsdata.faults import BadShard, NoUsablePhoto, TooManyFaults, WorkerLost
+from zsdata.faults import TOLD_IN_WORDS, in_words
 from zsdata.preview import contact_sheet
 from zsdata.progress import Progress
 from zsdata.sample import StereoBatch
@@ -43,7 +43,6 @@ from zsdata.synthesis.inpaint import Inpainter, load_inpainter
 from zsdata.worker import SHORTEST_SIDE_PX
 
 OK, FOUND_PROBLEMS, USER_ERROR, INTERRUPTED, PIPE_CLOSED = 0, 1, 2, 130, 141  # the last two as a shell counts signals
-TOLD_IN_WORDS = (OSError, ValueError, ImportError, BadShard, NoUsablePhoto, TooManyFaults, WorkerLost, MemoryError)
 SKIPPED_SHOWN = 20
 
 _URLS = (
@@ -67,21 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return PIPE_CLOSED
     except TOLD_IN_WORDS as error:
-        return _fail(_in_words(error), USER_ERROR)
-    except RuntimeError as error:  # what the error was about was added to it, see `zsdata.worker.naming`
-        cause = error.__cause__
-        if not isinstance(cause, TOLD_IN_WORDS):
-            raise
-        return _fail(str(error) if str(cause) else f"{error}{_in_words(cause)}", USER_ERROR)
-
-
-def _in_words(error: Exception) -> str:
-    if isinstance(error, OSError):
-        where = f"{error.filename}: " if error.filename and error.strerror else ""
-        return where + (error.strerror or str(error))
-    if isinstance(error, MemoryError):  # Python's own says nothing
-        return str(error) or "memory ran out; fewer workers, smaller pairs or smaller photos need less"
-    return str(error)
+        return _fail(in_words(error), USER_ERROR)
 
 
 def _fail(message: str, status: int) -> int:

@@ -51,8 +51,32 @@ class NoUsablePhoto(RuntimeError):
     """Neither a sample's photo nor any of its spares could be used."""
 
 
+class SampleFailed(RuntimeError):
+    """A sample could not be made for want of a file, a package, memory or a right value; the message names the sample and what it lacks."""
+
+
 class WorkerLost(RuntimeError):
     """A worker process was killed, ended or hangs; the message names the process and the sample that it was at."""
+
+
+MENDED_BY_THE_USER = (ImportError, MemoryError, OSError, ValueError)
+TOLD_IN_WORDS = (*MENDED_BY_THE_USER, BadShard, NoUsablePhoto, SampleFailed, TooManyFaults, WorkerLost)  # by commands, without a traceback
+
+
+def in_words(error: Exception) -> str:
+    """What an error says to whoever reads it without its traceback."""
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename and error.strerror else ""
+        return where + (error.strerror or str(error))
+    if isinstance(error, MemoryError):  # Python's own says nothing
+        return str(error) or "memory ran out; fewer workers, smaller pairs or smaller photos need less"
+    return str(error)
+
+
+def failed(sample: str, error: Exception) -> RuntimeError:
+    """What to raise from an error that a sample failed for: SampleFailed where whoever runs this can mend it."""
+    kind = SampleFailed if isinstance(error, MENDED_BY_THE_USER) else RuntimeError
+    return kind(f"{sample} failed: {in_words(error)}")
 
 
 @dataclass(frozen=True, kw_only=True)

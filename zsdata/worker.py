@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from zsdata.faults import BadPhoto, BadShard, NoUsablePhoto
+from zsdata.faults import BadPhoto, BadShard, NoUsablePhoto, failed
 from zsdata.meter import Meter
 from zsdata.plan import Choice
 from zsdata.prepared import Draft, Prepared, make
@@ -96,7 +96,7 @@ class Worker:
 
         Raises:
             NoUsablePhoto: when no spare can be used either, with the reasons.
-            RuntimeError: when a step fails, with the sample named.
+            SampleFailed, RuntimeError: when a step fails, with the sample named.
         """
         sources = self._recipe.schedule.at(epoch)
         pair = index - index % self._recipe.reuse
@@ -294,8 +294,8 @@ def naming(meta: dict[str, Any]) -> Iterator[None]:
     except (BadPhoto, BadShard):
         raise
     except Exception as error:
-        sample = f"sample {meta['index']} of epoch {meta['epoch']}"
-        raise RuntimeError(f'{sample} (source "{meta["source"]}", "{meta["key"]}" in {meta["shard"]}) failed: {error}') from error
+        place = f'source "{meta["source"]}", "{meta["key"]}" in {meta["shard"]}'
+        raise failed(f"sample {meta['index']} of epoch {meta['epoch']} ({place})", error) from error
 
 
 class _OpenCVAcrossFork:

@@ -764,13 +764,20 @@ def test_a_training_begins_with_the_weights_that_are_given_or_with_those_of_its_
         assert equal(weights_of_a_run("--seed", 2, "--initial-weights", path), first)
 
 
+@pytest.mark.parametrize("workers", [0, 1])
 @pytest.mark.parametrize(("cause", "words"), [(OSError("no such model"), True), (KeyError("a bug"), False)])
-def test_a_model_that_cannot_be_loaded_is_one_line_and_a_bug_is_a_traceback(monkeypatch, cause, words):
+def test_a_model_that_cannot_be_loaded_is_one_line_and_a_bug_is_a_traceback(monkeypatch, tmp_path, cause, words, workers):
+    def depth(images):
+        raise cause
+
     def main():
-        raise RuntimeError("sample 0 failed") from cause
+        stream = ZeroStereoStream(photo_tar(tmp_path / "a.tar", 1), size=(32, 48), depth=depth)
+        with stream.loader(1, num_workers=workers, multiprocessing_context="fork") as loader:
+            next(iter(loader))
 
     monkeypatch.setattr(sys, "argv", ["raft.py"])
-    with pytest.raises(SystemExit if words else RuntimeError, match=r"^raft.py: sample 0 failed$" if words else "sample 0 failed"):
+    told = r"sample 0 of epoch 0 \(.*\) failed: "
+    with pytest.raises(SystemExit, match=f"^raft.py: {told}no such model$") if words else pytest.raises(RuntimeError, match=told):
         run(main)
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from trainers.inpaint_data.examples import Draw, Example, from_photo, from_stereo
 from trainers.inpaint_data.layouts import StereoFolder
 from trainers.inpaint_data.tars import StereoTars
-from zsdata.faults import BadPhoto, BadShard, NoUsablePhoto
+from zsdata.faults import BadPhoto, BadShard, NoUsablePhoto, failed
 from zsdata.hub import hub_models
 from zsdata.meter import Meter
 from zsdata.plan import Choice, EpochPlan
@@ -243,7 +243,7 @@ class Examples:
         return self._plan.epoch_size
 
     def __getitem__(self, request: tuple[int, int]) -> ExampleBatch:
-        """Raises NoUsablePhoto when no spare can be used either, RuntimeError when a step fails, with the example named."""
+        """Raises NoUsablePhoto when no spare can be used either, SampleFailed or RuntimeError when a step fails, with the example named."""
         step, index = request
         epoch, place = self.place(step, index)
         draw = partial(rng, self._seed, step, index)
@@ -260,7 +260,7 @@ class Examples:
                 except (BadPhoto, BadShard) as fault:
                     rejected.append((name, *where, fault.reason))
                 except Exception as error:
-                    raise RuntimeError(f'example {index} of step {step} ("{where[1]}" in {where[0]}) failed: {error}') from error
+                    raise failed(f'example {index} of step {step} ("{where[1]}" in {where[0]})', error) from error
                 choice = self._plan.spare(epoch, place, len(rejected) - 1)
         last = "; ".join(f"{name} in {where}: {reason}" for _, where, name, reason in rejected[-3:])
         raise NoUsablePhoto(
