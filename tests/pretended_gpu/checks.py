@@ -9,7 +9,7 @@ from accelerate.state import AcceleratorState
 from safetensors.torch import load_file
 
 from benchmarks import tiers
-from tests.pretended_gpu.gpu import OnGpu, gpu
+from tests.pretended_gpu.gpu import OnGpu, brought, gpu
 from tests.scenes import photo_tar, shifted_pairs
 from tests.small_depth_networks import save_small_network
 from tests.small_pipeline import save_small_pipeline
@@ -19,7 +19,7 @@ from trainers import run_folder
 from trainers.models import load_matcher
 from trainers.models.checkpoint import WEIGHTS_FILE
 from trainers.validation import EvaluationSet
-from zsdata import DepthNetwork, DiffusionNetwork, ZeroStereoStream, load_depth
+from zsdata import DepthNetwork, DiffusionNetwork, ZeroStereoStream, load_depth, load_inpainter
 
 pytestmark = pytest.mark.filterwarnings("ignore::zsdata.synthesis.depth.builtin.BuiltinDepthWarning")
 
@@ -71,6 +71,20 @@ def test_it_computes_what_the_cpu_does_and_refuses_what_a_gpu_refuses():
         there.sum().item()
         there.add_(1)
         assert sum(waits.values()) == 1
+        brought.clear()
+        for mode in (torch.no_grad, torch.inference_mode):
+            with mode():
+                values.to("cuda", non_blocking=True)
+                torch.empty_like(there).copy_(values, non_blocking=True)
+                assert sum(brought.values()) == 0
+                values.to("cuda")
+                torch.empty_like(there).copy_(values)
+                torch.tensor([1.0], device="cuda")
+                assert sum(brought.values()) == 3
+                brought.clear()
+                waits.clear()
+                there.to("cpu")
+                assert sum(waits.values()) == 1
 
 
 def batches(photos, device, workers=1, micro_batch=None, **options):
@@ -141,6 +155,22 @@ def test_pairs_are_made_as_in_the_workers(folders, options):
         step = max(meta["largest_disparity_px"] for meta in one.meta) / 65_535 * 8  # of depth's 16 bits; a view may enlarge a part of it
         assert torch.allclose(one.disparity, other.disparity, atol=step) and torch.allclose(one.confidence, other.confidence, atol=1e-2)
         assert all((mask != other_mask).float().mean() <= 0.001 for mask, other_mask in zip(one.masks, other.masks, strict=True))
+
+
+def test_a_network_is_given_all_steps_of_a_micro_batch_without_a_wait(folders):
+    right, inpaint_mask = torch.full((4, 3, *SIZE), 9.0), torch.ones(4, 1, *SIZE, dtype=torch.bool)
+    with gpu() as waits:
+        inpainter = load_inpainter(diffusion(folders, micro_batch=2), "cuda")
+        depth = load_depth(DepthNetwork(str(folders["depth"]), micro_batch=2), "cuda")
+        right, inpaint_mask = right.to("cuda"), inpaint_mask.to("cuda")
+        prepared = [depth.prepare(torch.zeros(1, 3, *SIZE, dtype=torch.uint8))] * 2
+        waits.clear()
+        brought.clear()
+        inpainter(right, inpaint_mask, [np.random.default_rng(sample) for sample in range(4)])
+        assert not waits and sum(brought.values()) == 2  # each micro-batch's noise, before anything else of it
+        brought.clear()
+        list(depth.predict_mirrored(prepared, [SIZE] * 2))
+        assert not waits and not brought
 
 
 @pytest.mark.parametrize("precision", ["no", "bf16", "fp16"])

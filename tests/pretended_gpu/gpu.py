@@ -19,12 +19,13 @@ from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_mod
 from torch.utils._pytree import tree_leaves, tree_map
 
 CPU, GPU = torch.device("cpu"), torch.device("cuda", 0)
-COPIES = ("_to_copy", "copy_")  # take tensors of two devices
+COPIES = ("_to_copy", "copy_", "to")  # take tensors of two devices; inference mode has "to"
 INDEXED = ("index", "index_put_", "_index_put_impl_")  # take indices that lie on the CPU
 WAITING = ("_local_scalar_dense", "nonzero", "masked_select", "equal")  # end when the GPU has an answer
 OURS = ("zsdata", "trainers")
 
 waits: Counter[str] = Counter()  # for the GPU, by the function of ours that had to: "trainers.loop.train"
+brought: Counter[str] = Counter()  # likewise, copies to the GPU that wait until all is done that it was given before
 
 
 class OnGpu(Tensor):
@@ -78,6 +79,8 @@ def compute(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     by_mask = name in INDEXED and any(tensor.dtype == torch.bool for tensor in tensors[1:])
     if on_gpu and (name in WAITING or leaves or by_mask):
         waits[_waiting()] += 1
+    if to_gpu and _is_brought(name, args, kwargs):
+        brought[_waiting()] += 1
 
     def inner(leaf: Any) -> Any:
         if isinstance(leaf, torch.device):
@@ -89,6 +92,14 @@ def compute(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         return made
     made = tree_map(lambda leaf: OnGpu(leaf) if isinstance(leaf, Tensor) else leaf, made)
     return return_and_correct_aliasing(operation, args, kwargs, made) if on_gpu else made
+
+
+def _is_brought(name: str, args: Any, kwargs: dict[str, Any]) -> bool:
+    """Whether it is a copy from the CPU that is not `non_blocking`."""
+    if name not in COPIES:
+        return False
+    source, non_blocking = (args[1], args[2:3] == (True,)) if name == "copy_" else (args[0], False)
+    return not isinstance(source, OnGpu) and not (non_blocking or kwargs.get("non_blocking"))
 
 
 def _waiting() -> str:
@@ -267,6 +278,7 @@ def gpu() -> Iterator[Counter[str]]:
             if getattr(module, name, None) in (save_file, _SafeOpen.real):
                 replaced[f"{module.__name__}.{name}"] = value
     waits.clear()
+    brought.clear()
     overwrites = torch.__future__.get_overwrite_module_params_on_conversion()
     with ExitStack() as stack:
         for name, value in replaced.items():

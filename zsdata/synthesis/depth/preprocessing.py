@@ -110,7 +110,8 @@ class Preprocessing:
 
     def normalise(self, inputs: Tensor) -> Tensor:
         """uint8 [B, 3, h, w] to float32: rescaled, then by the channels' means and deviations."""
-        mean, std = (torch.tensor(values, device=inputs.device).view(1, 3, 1, 1) for values in (self.mean, self.std))
+        of_channels = (torch.tensor(values).view(1, 3, 1, 1) for values in (self.mean, self.std))
+        mean, std = (values.to(inputs.device, non_blocking=True) for values in of_channels)
         return (inputs.float() * self.rescale - mean) / std
 
     def restore(self, predicted: Tensor, size: tuple[int, int]) -> Tensor:

@@ -78,6 +78,7 @@ class DiffusionInpainter:
         self._unet, self._autoencoder = (part.to(memory_format=torch.channels_last) for part in (parts.unet, parts.autoencoder))
         to_device((self._unet, self._autoencoder), self.device, "diffusion inpainting", cure)
         self._prompt = parts.prompt.to(self.device)
+        self._timesteps = self._scheduler.timesteps.to(self.device)  # kept, because a GPU waits for whatever is brought there
         if network.compile:
             mode = network.compile if isinstance(network.compile, str) else None
             for module in (self._unet, self._autoencoder.encoder, self._autoencoder.decoder):
@@ -254,8 +255,8 @@ class DiffusionInpainter:
         prompt = self._prompt.expand(len(noise), -1, -1)
         beside = torch.cat([mask.to(dtype), masked_latents.to(dtype)], dim=1)
         latents = noise * scheduler.init_noise_sigma
-        timesteps = scheduler.timesteps[:most_steps]
-        for timestep, timestep_on_device in zip(timesteps, timesteps.to(self.device), strict=True):
+        timesteps = scheduler.timesteps[:most_steps], self._timesteps[:most_steps]
+        for timestep, timestep_on_device in zip(*timesteps, strict=True):
             noisy = torch.cat([scheduler.scale_model_input(latents, timestep).to(dtype), beside], dim=1)
             self._begin()
             predicted = self._unet(noisy, timestep_on_device, encoder_hidden_states=prompt).sample.to(torch.float32, copy=True)
