@@ -302,6 +302,8 @@ class ZeroStereoStream(IterableDataset):
         device = torch.device(device)
         if device.type == "cuda" and (device.index or 0) >= (gpus := torch.cuda.device_count()):
             raise ValueError(f'device="{device}", but PyTorch sees {gpus} GPU{"" if gpus == 1 else "s"} here; device="cpu" needs none')
+        if device.type == "cuda" and device.index is None:  # which one that is may differ later, and in another thread
+            device = torch.device("cuda", torch.cuda.current_device())
         if (rank is None) != (world_size is None):
             raise ValueError(f"rank and world_size are given together or not at all; got rank={rank}, world_size={world_size}")
         rank, world_size = launched_as() if rank is None or world_size is None else (rank, world_size)

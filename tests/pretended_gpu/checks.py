@@ -1,6 +1,7 @@
 """What runs where there is a GPU, run on a pretended one; `tests/test_on_a_pretended_gpu.py` starts this in a process that can pretend."""
 
 import json
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -155,6 +156,12 @@ def test_pairs_are_made_as_in_the_workers(folders, options):
         step = max(meta["largest_disparity_px"] for meta in one.meta) / 65_535 * 8  # of depth's 16 bits; a view may enlarge a part of it
         assert torch.allclose(one.disparity, other.disparity, atol=step) and torch.allclose(one.confidence, other.confidence, atol=1e-2)
         assert all((mask != other_mask).float().mean() <= 0.001 for mask, other_mask in zip(one.masks, other.masks, strict=True))
+
+
+def test_a_loader_stays_on_the_gpu_that_was_current_when_it_was_made(folders):
+    with gpu(), mock.patch("torch.cuda.device_count", lambda: 2), mock.patch("torch.cuda.current_device", lambda: 1):
+        loader = ZeroStereoStream(folders["photos"], size=SIZE).loader(2, device="cuda")
+    assert loader.device == torch.device("cuda", 1)
 
 
 def test_a_network_is_given_all_steps_of_a_micro_batch_without_a_wait(folders):
