@@ -168,7 +168,8 @@ class StereoLoader:
         that this rank refused, by reason; `examples`: (source, shard, key, reason) of the first ones; `shard_problems`: faults of the
         shards themselves, by reason; `micro_batch_lowered`: how often a network had to take fewer at once because memory ran out;
         `seconds`: time by stage, those of the workers added up over all of them, "wait" being how long the training process stood still for
-        lack of a prepared batch.
+        lack of a prepared batch. On a GPU they go by the clock of this process: the first stage that waits for the GPU, most often
+        "inpaint", has in it what the training had left it to do.
         """
         return {
             "batches": self._batches,
