@@ -79,6 +79,15 @@ def test_a_loop_that_was_broken_off_goes_on_where_it_stopped(tar, plain):
     assert by_index(pairs) == plain and stream.state_dict()["samples"] == 12
 
 
+def test_a_loop_that_was_broken_off_at_its_last_pair_goes_on_with_the_next_epoch(tar):
+    stream, resumed = open_stream(tar, epoch_size=2), open_stream(tar, epoch_size=2)
+    assert len(list(islice(stream, 2))) == 2
+    resumed.load_state_dict(stream.state_dict())
+    assert [pair.meta["epoch"] for pair in stream] == [1, 1] == [pair.meta["epoch"] for pair in resumed]
+    single = open_stream(tar, epoch_size=1)
+    assert [next(iter(single)).meta["epoch"] for _ in range(3)] == [0, 1, 2]
+
+
 def test_a_state_brings_the_loop_over_the_stream_back(tar, plain):
     first = open_stream(tar)
     pairs = list(islice(first, 5))

@@ -222,6 +222,8 @@ class ZeroStereoStream(IterableDataset):
         """The finished pairs of an epoch, on the CPU, without a batch axis; from where the last loop stopped."""
         info = get_worker_info()
         if info is None:
+            if self._samples >= self.epoch_size(self._epoch):  # the last loop was broken off at its last pair
+                self._epoch, self._samples = self._epoch + 1, 0
             return self._pairs(0, 1)
         if self._loop_is_open:  # pairs are fetched ahead, so the workers stand at different places, or one of them in the next epoch
             self._epoch, self._samples = self._epoch + 1, 0
