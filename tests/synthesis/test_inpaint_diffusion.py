@@ -16,9 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from safetensors.torch import load_file, save_file
+from torch.utils.data import DataLoader
 
 from tests import oracles_diffusion as oracle
-from tests.scenes import SHARED, photo_tar
+from tests.scenes import SHARED, layered_depth, photo_tar
 from zsdata import ZeroStereoStream, load_inpainter
 from zsdata.seeding import rng
 from zsdata.synthesis import micro_batch
@@ -616,6 +617,20 @@ def test_latents_are_not_clipped_whatever_the_pipelines_scheduler_says(folder, c
     clipped, expected = (load_inpainter(path, steps=2, scheduler=scheduler) for path in (copy, folder))
     right, inpaint_mask = scenes(1)
     assert torch.equal(clipped(right, inpaint_mask, generators(0)), expected(right, inpaint_mask, generators(0)))
+
+
+def test_a_loaded_pipeline_travels_to_other_processes(folder, tmp_path):
+    """By its name: a fork server takes few of the hundreds of files of shared memory that its weights would be."""
+    loaded = load_inpainter(folder, steps=2, dtype="bf16", micro_batch=3)
+    again = pickle.loads(pickle.dumps(loaded))
+    assert (again.network, again.device) == (loaded.network, loaded.device)
+    assert torch.equal(again(*scenes(1), generators(0)), loaded(*scenes(1), generators(0)))
+    pipeline = DiffusionNetwork(str(folder), steps=1)
+    stream = ZeroStereoStream(photo_tar(tmp_path / "photos.tar", 2), size=(64, 96), depth=layered_depth, inpaint=pipeline)
+    plain = [pair.right for pair in stream]  # it has loaded the pipeline by now
+    stream.set_epoch(0)
+    pairs = DataLoader(stream, batch_size=None, num_workers=1, multiprocessing_context="forkserver")
+    assert torch.equal(torch.stack([pair.right for pair in pairs]), torch.stack(plain))
 
 
 def test_no_samples_are_no_work(inpainter):

@@ -89,6 +89,10 @@ class DiffusionInpainter:
         self._found: _Found | None = None
         self._compiled_for: set[int] = set()  # numbers of samples that compiled networks have seen
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Another process loads it anew: weights would travel as hundreds of files of shared memory, and round otherwise there."""
+        return type(self), (self.pinned, self.device)
+
     def __call__(self, right: Tensor, inpaint_mask: Tensor, generators: Sequence[np.random.Generator]) -> Tensor:
         """`right` with its holes filled.
 
