@@ -47,7 +47,7 @@ def plain(tar):
     return by_index(open_stream(tar))
 
 
-def test_a_pair_unpacks_into_the_documented_fields(tar):
+def test_a_pair_unpacks_into_the_documented_fields(tar, tmp_path):
     left, right, disparity, confidence, masks = pair = next(iter(open_stream(tar)))
     for image in (left, right, pair.left_clean, pair.right_clean):
         assert image.shape == (3, *SIZE) and image.dtype == torch.float32
@@ -59,6 +59,8 @@ def test_a_pair_unpacks_into_the_documented_fields(tar):
         assert mask.shape == (1, *SIZE) and mask.dtype == torch.bool
     assert masks.nonocclusion.any() and masks.inpaint.any() and masks.valid.all()
     assert json.loads(json.dumps(pair.meta)) == pair.meta
+    torch.save(pair.meta, tmp_path / "meta.pt")
+    assert torch.load(tmp_path / "meta.pt", weights_only=True) == pair.meta  # nothing of NumPy's
 
 
 def test_an_epoch_is_one_exact_pass_and_the_next_one_another_order(tar):

@@ -51,7 +51,7 @@ class AdaptiveDisparity:
     def draw_scale(self, generator: np.random.Generator, width: float) -> float:
         """The disparity of the nearest point as a share of `width`; in (c - 2 r, c + 2 r)."""
         del width
-        which, where = generator.random(2)
+        which, where = generator.random(2).tolist()
         where = min(max(where, 1e-6), 1 - 1e-6)  # the ranges are open
         if which < self.small_probability:
             low = self.center - 2 * self.radius
