@@ -12,7 +12,7 @@ import time
 from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NoReturn, cast
 
 import torch
 from accelerate import Accelerator
@@ -139,7 +139,8 @@ def tune(
         training, state = run_folder.load(checkpoint)
         run_folder.require_options(checkpoint, state, options, f"--pipeline {checkpoint / PIPELINE}")
         step, refused_before = state["step"], Counter(state["refused"])
-        if step >= config.steps:
+        judgeable = cases and checkpoint.resolve() == run_folder.folder_of(output, step).resolve()
+        if step >= config.steps and not judgeable:  # a run may have been ended while its last checkpoint was judged
             raise ValueError(f"{checkpoint} has all of the {config.steps} steps already")
         Position.from_state(state["examples"], examples.position(step))
         unet = type(unet).from_pretrained(checkpoint / PIPELINE / UNET, use_safetensors=True)
@@ -223,6 +224,11 @@ def tune(
         if accelerator.is_main_process:
             run_folder.append(output / "validation.jsonl", {"step": step, "mean": mean, "pairs": scores})
 
+    def end(saved: Path) -> NoReturn:
+        accelerator.print(f"asked to end by SIGTERM: {saved} is saved, and --resume {output} goes on from it")
+        accelerator.end_training()
+        raise Terminated
+
     validate(checkpoint)
     asked = requests(step, config.steps, config.batch_size, config.micro_batch, accelerator.process_index, accelerator.num_processes)
     progress = Progress(total=config.steps, initial=step, unit="step", disable=not accelerator.is_main_process, dynamic_ncols=True)
@@ -271,12 +277,14 @@ def tune(
                     run_folder.append(output / "log.jsonl", {"step": step, **values, "refused": reasons})
                 accelerator.log({**values, "refused": sum(reasons.values())}, step=step)
             if step < config.steps and termination.asked(accelerator.device):
-                saved = save()
-                accelerator.print(f"asked to end by SIGTERM: {saved} is saved, and --resume {output} goes on from it")
-                accelerator.end_training()
-                raise Terminated
+                end(save())
             if step % config.save_every == 0 or step == config.steps:
-                validate(save())
+                saved = save()
+                try:
+                    with termination.at_once():
+                        validate(saved)
+                except Terminated:
+                    end(saved)
     progress.close()
     accelerator.print(_summary(refused()))
     folder = run_folder.folder_of(output, step) / PIPELINE

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NoReturn, cast
 
 import torch
 from accelerate.tracking import GeneralTracker
@@ -179,6 +179,8 @@ def train(
     if tracker is not None:
         accelerator.init_trackers(output.name or "run", {name: value for name, value in asdict(config).items() if value is not None})
 
+    termination = Termination()
+
     def save() -> Path:
         folder = run_folder.folder_of(output, step)
         if checkpoint is not None and checkpoint.resolve() == folder.resolve():
@@ -205,6 +207,11 @@ def train(
         accelerator.wait_for_everyone()
         return folder
 
+    def end(saved: Path) -> NoReturn:
+        accelerator.print(f"asked to end by SIGTERM: {saved} is saved, and --resume {output} goes on from it")
+        accelerator.end_training()
+        raise Terminated
+
     def is_to_be_judged() -> bool:
         """Whether it is this step's turn, the last one's aside."""
         every = config.evaluate_every
@@ -212,15 +219,18 @@ def train(
 
     def judge(saved: Path) -> dict[str, list[dict[str, Any]]]:
         """Scores of this step's checkpoint, written down; if it is the best so far, it is kept."""
-        with weights_of(average, matcher):
-            results = validation.judge(
-                lambda left, right: matcher.predict(left, right, iterations=config.evaluation_iterations),
-                device=accelerator.device,
-                rank=accelerator.process_index,
-                world_size=accelerator.num_processes,
-                out_of_memory=f"{saved} is saved, and trainers/evaluate.py --tile-rows 512 can judge it; --resume {output} goes on "
-                "with --corr-implementation alt (RAFT-Stereo), with smaller images for --evaluate, or without it",
-            )
+        try:
+            with termination.at_once(), weights_of(average, matcher):
+                results = validation.judge(
+                    lambda left, right: matcher.predict(left, right, iterations=config.evaluation_iterations),
+                    device=accelerator.device,
+                    rank=accelerator.process_index,
+                    world_size=accelerator.num_processes,
+                    out_of_memory=f"{saved} is saved, and trainers/evaluate.py --tile-rows 512 can judge it; --resume {output} goes on "
+                    "with --corr-implementation alt (RAFT-Stereo), with smaller images for --evaluate, or without it",
+                )
+        except Terminated:
+            end(saved)
         best = validation.is_best(results, step)
         if accelerator.is_main_process:
             _write_scores(output, step, results, validation)
@@ -240,7 +250,7 @@ def train(
 
     results: dict[str, list[dict[str, Any]]] = {}
     with (
-        Termination() as termination,
+        termination,
         loader,
         Progress(total=config.steps, initial=step, unit="step", disable=not accelerator.is_main_process, dynamic_ncols=True) as progress,
     ):
@@ -297,10 +307,7 @@ def train(
                 if step == config.steps:
                     break
                 if termination.asked(accelerator.device):
-                    saved = save()
-                    accelerator.print(f"asked to end by SIGTERM: {saved} is saved, and --resume {output} goes on from it")
-                    accelerator.end_training()
-                    raise Terminated
+                    end(save())
                 if is_to_be_judged():
                     results = judge(save())
                 elif step % config.save_every == 0:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
@@ -20,7 +22,7 @@ class Terminated(SystemExit):
 
 
 class Termination:
-    """While it is entered, SIGTERM only leaves a note: a step is finished first.
+    """While it is entered, SIGTERM only leaves a note: a step is finished first. What `at_once` surrounds it ends there and then.
 
     Whoever sends it may send it twice, once to all processes and once through the launcher. Outside of the main thread, where Python
     lets nobody handle signals, the signal does what it did before.
@@ -28,11 +30,23 @@ class Termination:
 
     def __init__(self) -> None:
         self._noted = False
+        self._at_once = False
         self._before: Any = None
 
     def asked(self, device: torch.device) -> bool:
         """Whether any rank has got the signal; the same answer on all ranks, which all must ask."""
         return on_any_rank(self._noted, device)
+
+    @contextmanager
+    def at_once(self) -> Iterator[None]:
+        """Around what takes long and has its checkpoint saved: each rank that gets the signal, or has it already, raises Terminated."""
+        self._at_once = True
+        try:
+            if self._noted:
+                raise Terminated
+            yield
+        finally:
+            self._at_once = False
 
     def __enter__(self) -> Termination:
         if threading.current_thread() is threading.main_thread():
@@ -45,3 +59,6 @@ class Termination:
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self._noted = True
+        if self._at_once:
+            self._at_once = False  # it may come twice
+            raise Terminated

@@ -464,6 +464,33 @@ def test_a_resumed_run_knows_the_best(pipeline, photos, tmp_path, monkeypatch, o
     assert step_of(tmp_path / output / "best") == best_of(tmp_path / output)["step"] == 2
 
 
+@pytest.mark.parametrize("step", [2, 4])
+def test_a_run_that_is_asked_to_end_while_a_checkpoint_is_judged_ends_at_once_and_judges_it_when_resumed(
+    pipeline, photos, tmp_path, monkeypatch, capsys, step
+):
+    """The last one, too."""
+    examples, settings, options = examples_of(photos=photos), config(steps=4), {"pairs": [real_pair(0), real_pair(1)]}
+    judged_as(monkeypatch, [9, 9, 11, 10, 12])
+    judged, score = [], inpaint_loop.score_holes
+
+    def ended(folder, case, number, seed):
+        judged.append(step_of(folder.parent) if folder.name == inpaint_loop.PIPELINE else 0)
+        if judged[-1] == step:
+            psutil.Process().terminate()
+        return score(folder, case, number, seed)
+
+    with monkeypatch.context() as patch, pytest.raises(SystemExit) as end:
+        patch.setattr(inpaint_loop, "score_holes", ended)
+        run(pipeline, examples, tmp_path, settings, resume=tmp_path, **options)
+    assert end.value.code == 143 and judged.count(step) == 1
+    assert f"step-0000000{step} is saved, and --resume {tmp_path} goes on from it" in capsys.readouterr().out
+    run(pipeline, examples, tmp_path, settings, resume=tmp_path, **options)
+    assert [json.loads(line)["step"] for line in (tmp_path / "validation.jsonl").read_text().splitlines()] == [0, 2, 4]
+    assert step_of(tmp_path / "best") == 4
+    with pytest.raises(ValueError, match="has all of the 4 steps already"):
+        run(pipeline, examples, tmp_path / "another", settings, resume=tmp_path, **options)
+
+
 def test_a_best_that_is_lost_or_was_told_by_other_pairs_is_forgotten(pipeline, photos, tmp_path, monkeypatch):
     examples, settings = examples_of(photos=photos), config(steps=4, save_every=1)
     judged_as(monkeypatch, [9, 15, 12, 10, 10], cut_at=4)

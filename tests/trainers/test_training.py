@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -191,6 +192,29 @@ def test_a_run_that_is_asked_to_end_saves_the_step_it_is_at(tar, tmp_path, capsy
     assert ended + resumed == whole and len(ended) == 3 * accumulate
     for name, weight in unbroken.state_dict().items():
         assert torch.equal(after.state_dict()[name], weight), name
+
+
+@pytest.mark.parametrize("step", [2, 3])
+def test_a_run_that_is_asked_to_end_while_it_is_judged_ends_at_once_and_is_judged_when_resumed(
+    tar, tmp_path, pairs_folder, monkeypatch, capsys, step
+):
+    settings, output = config(steps=3, evaluate_every=2, evaluation_iterations=1), tmp_path / "run"
+    sets, judged, predict = [EvaluationSet.parse(str(pairs_folder))], [], RAFTStereo.predict
+
+    def ended(*arguments, **options):
+        judged.append(int(run_folder.newest(output).name[-1]))
+        if judged[-1] == step:
+            psutil.Process().terminate()
+        return predict(*arguments, **options)
+
+    with monkeypatch.context() as patch, pytest.raises(SystemExit) as end:
+        patch.setattr(RAFTStereo, "predict", ended)
+        run_training(tar, output, settings, sets=sets, resume=output)
+    assert end.value.code == 143 and judged.count(step) == 1
+    assert f"step-0000000{step} is saved, and --resume {output} goes on from it" in capsys.readouterr().out
+    AcceleratorState._reset_state(reset_partial_state=True)
+    run_training(tar, output, settings, sets=sets, resume=output)
+    assert [line["step"] for line in read_lines(output / "evaluations.jsonl")] == [2, 3]
 
 
 def test_every_step_has_as_many_batches_wherever_an_epoch_ends(tar, tmp_path, monkeypatch):
@@ -690,6 +714,24 @@ def test_ranks_end_with_the_one_that_is_asked_to(tar, tmp_path):
     assert done.returncode != 0 and done.stdout.count("asked to end by SIGTERM") == 1
     assert len(read_lines(output / "samples-0.jsonl")) == len(read_lines(output / "samples-1.jsonl")) == 2
     assert run_folder.newest(output).name == "step-00000002" and run_folder.load(run_folder.newest(output))[1]["stream"]["samples"] == 4
+
+
+def test_a_run_ends_with_the_launcher_that_started_it_alone(tar, tmp_path):
+    """`accelerate launch` of one process does not hand SIGTERM on."""
+    output = tmp_path / "run"
+    command = [*ACCELERATE, 1, "trainers/raft.py", *arguments_for(tar, output, "--steps", 10**6, "--save-every", 1)]
+    with subprocess.Popen([*map(str, command)], cwd=ROOT, stdout=subprocess.PIPE, text=True) as launcher:
+        while not list((output / "checkpoints").glob("step-*")):
+            assert launcher.poll() is None
+            time.sleep(0.1)
+        (trainer,) = psutil.Process(launcher.pid).children()
+        launcher.terminate()
+        try:
+            said, _ = launcher.communicate(timeout=30)  # until nobody has the pipe open
+        finally:
+            if trainer.is_running():
+                trainer.kill()
+    assert f"{run_folder.newest(output)} is saved, and --resume {output} goes on from it" in said
 
 
 def test_a_second_run_keeps_out_of_the_folder_of_one_that_is_at_work(tar, tmp_path, monkeypatch):
