@@ -61,8 +61,9 @@ def check_output(output: Path, resume: Path | None) -> Path | None:
         return start
     last = max(there, key=_step)
     if start is None:
+        source = output if _whole(output) else last
         raise FileExistsError(
-            f"{output} holds the checkpoints of an earlier run, up to step {_step(last)}: --resume {output} goes on with it; "
+            f"{output} holds the checkpoints of an earlier run, up to step {_step(last)}: --resume {source} goes on with it; "
             "or give another --output"
         )
     if not start.resolve().is_relative_to(output.resolve()):

@@ -130,8 +130,11 @@ def test_a_new_run_is_refused_in_the_folder_of_another_and_told_the_way_out(tmp_
     with pytest.raises(FileExistsError, match=rf"{tmp_path}/old holds .* up to step 200: --resume {tmp_path}/old .* another --output"):
         run_folder.check_output(tmp_path / "old", None)
     shutil.move(tmp_path / "old" / "checkpoints" / "step-00000100", tmp_path / "best" / "best")
-    with pytest.raises(FileExistsError, match="up to step 100"):
-        run_folder.check_output(tmp_path / "best", None)
+    best = tmp_path / "best" / "best"
+    for resume in (None, tmp_path / "best"):
+        with pytest.raises(FileExistsError, match=rf"up to step 100: --resume {best} goes on"):
+            run_folder.check_output(tmp_path / "best", resume)
+    assert run_folder.check_output(tmp_path / "best", best) == best
     (tmp_path / "file").touch()
     with pytest.raises(NotADirectoryError, match=r"--output .*file is a file"):
         run_folder.check_output(tmp_path / "file", None)
