@@ -15,7 +15,7 @@ from trainers.loop import LossFunction, TrainConfig, train
 from trainers.models import Matcher, load_checkpoint
 from trainers.models.checkpoint import WEIGHTS_FILE
 from trainers.models.matcher import SIZE_MULTIPLE_PX
-from trainers.ranks import start_missing_ranks
+from trainers.ranks import end_with_launcher, start_missing_ranks
 from trainers.scores import METRICS
 from trainers.step_guard import TrainingDiverged
 from trainers.training_loss import LOSSES
@@ -328,6 +328,7 @@ def train_as_told(arguments: argparse.Namespace, matcher: Matcher, loss_function
 def run(main: Any) -> None:
     """Runs a trainer's main on every rank; a wrong argument or a missing file is one line in words, not a traceback."""
     try:
+        end_with_launcher()
         start_missing_ranks()
         main()
     except (*TOLD_IN_WORDS, TrainingDiverged) as error:

@@ -5,7 +5,9 @@ On the CPU `accelerate launch --num_processes N` starts a single process, unless
 
 from __future__ import annotations
 
+import ctypes
 import os
+import signal
 import sys
 
 import psutil
@@ -16,6 +18,22 @@ from accelerate.commands.launch import launch_command_parser
 from torch import Tensor
 
 RANKED_BY = ("WORLD_SIZE", "PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE")  # torchrun, Intel MPI, Open MPI, MVAPICH
+_SET_PARENT_DEATH_SIGNAL = 1  # prctl
+
+
+def end_with_launcher() -> None:
+    """Has this process get SIGTERM when the accelerate launch that started it alone ends.
+
+    That one ends by SIGTERM without handing it on, and this one would be left behind, with the GPU. Launchers of several hand it on.
+    """
+    if any(name in os.environ for name in RANKED_BY):
+        return
+    launcher = os.getppid()
+    if _launched_with() is None:
+        return
+    ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGTERM)
+    if os.getppid() != launcher:  # it has just ended
+        signal.raise_signal(signal.SIGTERM)
 
 
 def start_missing_ranks() -> None:
@@ -44,15 +62,28 @@ def start_missing_ranks() -> None:
 
 def _processes_asked_for() -> int | None:
     """`--num_processes` of the accelerate launch that started this process, from its command line or its configuration file."""
-    parent = psutil.Process().parent()
-    words = parent.cmdline() if parent is not None else []
+    words = _launched_with()
+    if words is None:
+        return None
+    launched, _ = launch_command_parser().parse_known_args(words)
+    if launched.num_processes is not None:
+        return launched.num_processes
+    if launched.config_file is not None or os.path.isfile(default_config_file):
+        return getattr(load_config_from_file(launched.config_file), "num_processes", None)
+    return None
+
+
+def _launched_with() -> list[str] | None:
+    """The arguments of the accelerate launch that started this process; None if something else did, or what it was is hidden."""
+    try:
+        parent = psutil.Process().parent()
+        words = parent.cmdline() if parent is not None else []
+    except psutil.Error:
+        return None
     for i, word in enumerate(words):
-        if os.path.basename(word) in ("accelerate-launch", "accelerate.commands.launch") or (word == "launch" and i):
-            launched, _ = launch_command_parser().parse_known_args(words[i + 1 :])
-            if launched.num_processes is not None:
-                return launched.num_processes
-            if launched.config_file is not None or os.path.isfile(default_config_file):
-                return getattr(load_config_from_file(launched.config_file), "num_processes", None)
+        before = words[i - 1] if i else ""
+        if os.path.basename(word) in ("accelerate-launch", "accelerate.commands.launch") or (word == "launch" and "accelerate" in before):
+            return words[i + 1 :]
     return None
 
 
