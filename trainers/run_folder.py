@@ -21,7 +21,7 @@ import shutil
 import socket
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -107,7 +107,8 @@ def claimed(output: Path) -> Iterator[None]:
             file.flush()
             yield
         finally:
-            fcntl.flock(file, fcntl.LOCK_UN)  # closing is not enough: a process forked meanwhile has the file open too
+            with suppress(OSError):  # where there are no locks
+                fcntl.flock(file, fcntl.LOCK_UN)  # closing is not enough: a process forked meanwhile has the file open too
 
 
 def save(output: Path, step: int, matcher: nn.Module, config: dict[str, Any], training: dict[str, Any], state: dict[str, Any]) -> Path:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import multiprocessing
 import os
@@ -19,6 +21,7 @@ from safetensors.torch import load_file
 from torch import nn
 
 from trainers import run_folder
+from trainers.termination import Terminated
 
 TOUCHES = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.scandir", "os.listdir"}  # audit events of files and folders
 
@@ -215,6 +218,18 @@ def test_a_folder_that_a_run_is_at_work_in_is_refused_until_it_ends_however_that
     process.join()
     with run_folder.claimed(tmp_path / "run"):
         pass
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP])
+def test_on_a_file_system_without_locks_a_run_begins_and_ends_as_elsewhere(tmp_path, monkeypatch, number):
+    def none(descriptor, operation):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", none)
+    with run_folder.claimed(tmp_path):
+        pass
+    with pytest.raises(Terminated), run_folder.claimed(tmp_path):
+        raise Terminated
 
 
 def test_one_rank_keeps_other_runs_out_for_all(tmp_path, monkeypatch):
