@@ -137,6 +137,7 @@ def train(
         device=accelerator.device,
         rank=accelerator.process_index,
         world_size=accelerator.num_processes,
+        multiprocessing_context="fork",  # a fork server, Python's choice from 3.14 on, ends by a SIGTERM to all processes, and they with it
     )
     pairs_per_step = config.batch_size * config.accumulate * accelerator.num_processes
     output.mkdir(parents=True, exist_ok=True)

@@ -78,8 +78,8 @@ class WorkerPool:
 
     Each process has a channel of its own, so that one that is killed leaves no lock behind for the others to wait for. Processes end with
     the pool and with the process that made it, even when that one is killed. Where that one handles SIGTERM, as a trainer does that saves
-    its place when a cluster ends it, they leave the signal to it. Batches are handed over in memory without a name (see `zsdata.parcel`),
-    so that it is of no account how small /dev/shm is.
+    its place when a cluster ends it, they leave the signal to it (but a "forkserver" ends by it, and they with that). Batches are handed
+    over in memory without a name (see `zsdata.parcel`), so that it is of no account how small /dev/shm is.
 
     Args:
         requests: taken as far ahead as batches are made ahead.

@@ -19,7 +19,7 @@ from skimage.metrics import structural_similarity
 from tests.scenes import SHARED, layered_depth, photo, photo_tar, write_tar
 from tests.small_pipeline import save_small_pipeline
 from tests.trainers.test_inpaint_data import pfm, png
-from tests.trainers.test_training import launch
+from tests.trainers.test_training import fork_server, launch
 from trainers import inpaint, inpaint_loop, run_folder
 from trainers.arguments import run as run_trainer
 from trainers.hole_scores import hole_cases, score_holes
@@ -234,6 +234,19 @@ def test_a_run_that_is_asked_to_end_saves_the_step_it_is_at(pipeline, photos, tm
     resumed = run(pipeline, examples_of(photos=photos), tmp_path / "ended", settings, resume=tmp_path / "ended")
     expected, found = weights(unbroken), weights(resumed)
     assert all(torch.equal(found[name], weight) for name, weight in expected.items())
+
+
+def test_workers_are_forked_by_the_trainer_itself(pipeline, photos, tmp_path, monkeypatch):
+    asked = NoisePrediction.loss
+
+    def loss(self, model, batch):
+        workers = psutil.Process().children(recursive=True)
+        assert len(workers) >= 2 and set(workers) == set(psutil.Process().children())
+        return asked(self, model, batch)
+
+    monkeypatch.setattr(NoisePrediction, "loss", loss)
+    with fork_server():
+        run(pipeline, examples_of(photos=photos), tmp_path, config(steps=1, workers=2))
 
 
 def test_another_run_keeps_its_checkpoints_and_no_photo_is_read(pipeline, photos, tmp_path, monkeypatch):

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -192,6 +194,27 @@ def test_a_run_that_is_asked_to_end_saves_the_step_it_is_at(tar, tmp_path, capsy
     assert ended + resumed == whole and len(ended) == 3 * accumulate
     for name, weight in unbroken.state_dict().items():
         assert torch.equal(after.state_dict()[name], weight), name
+
+
+@contextmanager
+def fork_server():
+    """Python's own choice from 3.14 on."""
+    before = multiprocessing.get_start_method()
+    multiprocessing.set_start_method("forkserver", force=True)
+    try:
+        yield
+    finally:
+        multiprocessing.set_start_method(before, force=True)
+
+
+def test_workers_are_forked_by_the_trainer_itself_as_a_server_would_end_by_a_signal_to_all_processes(tar, tmp_path):
+    def loss(initial, sequence, batch):
+        workers = psutil.Process().children(recursive=True)
+        assert len(workers) >= 2 and set(workers) == set(psutil.Process().children())
+        return PAPERS_LOSS(initial, sequence, batch)
+
+    with fork_server():
+        run_training(tar, tmp_path / "run", config(steps=1, workers=2), loss=loss)
 
 
 @pytest.mark.parametrize("step", [2, 3])

@@ -40,7 +40,7 @@ def making(examples: Examples, asked: Iterator[Request], workers: int, device: t
         ([examples.place(*request) for request in batch] for batch in asked),
         processes=workers,
         ahead=PREFETCHED_BATCHES,
-        context=None,
+        context="fork",  # a fork server, Python's choice from 3.14 on, ends by a SIGTERM to all processes, and they with it
         timeout_seconds=SAMPLE_TIMEOUT_SECONDS,
         take=Tensor.pin_memory if device.type == "cuda" else Tensor.clone,
     )
