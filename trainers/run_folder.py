@@ -33,6 +33,7 @@ from torch import nn
 from trainers.models import save_checkpoint
 from trainers.models.checkpoint import WEIGHTS_FILE
 from zsdata.launch import launched_as
+from zsdata.source.writing import writing
 
 KEPT_CHECKPOINTS = 3
 LOCK = ".lock"  # in the output; names the process that holds it
@@ -235,7 +236,7 @@ def require_options(checkpoint: Path, state: dict[str, Any], options: dict[str, 
 def append(path: Path, values: dict[str, Any]) -> None:
     """One more line of JSON; what is not finite, which JSON does not know, is null."""
     finite = {name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in values.items()}
-    with path.open("a") as file:
+    with writing(path), path.open("a") as file:
         file.write(json.dumps(finite) + "\n")
 
 

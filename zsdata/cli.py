@@ -16,14 +16,13 @@ from functools import partial
 from pathlib import Path
 
 import cv2
-import numpy as np
 import torch
 
 import zsdata
 from zsdata.augment import AugmentConfig
 from zsdata.bench import REST, BenchReport, advice, bench, fill_depth_cache, leave_holes, samples_needed
 from zsdata.example_photos import EXAMPLE_PHOTOS, pack_example_photos
-from zsdata.export import export_pairs
+from zsdata.export import export_pairs, write_whole
 from zsdata.faults import TOLD_IN_WORDS, in_words
 from zsdata.preview import contact_sheet
 from zsdata.progress import Progress
@@ -34,6 +33,7 @@ from zsdata.source.index import write_index
 from zsdata.source.pack import PackReport, pack
 from zsdata.source.urls import expand_urls
 from zsdata.source.verify import verify
+from zsdata.source.writing import writing
 from zsdata.sources import parse_sources
 from zsdata.statistics import source_statistics
 from zsdata.stream import ZeroStereoStream
@@ -397,7 +397,8 @@ def _preview(options: argparse.Namespace) -> int:
         augmentation=AugmentConfig.none() if options.clean else None,
     )
     pairs = _take(stream, options.epoch, options.first_index, options.pairs)
-    _write_png(output, contact_sheet(pairs))
+    sheet = cv2.imencode(".png", cv2.cvtColor(contact_sheet(pairs), cv2.COLOR_RGB2BGR))[1]
+    write_whole(output, sheet.tobytes())
     (height, width), last = options.size, pairs[-1].meta
     print(
         f"{_printable(str(output))}: {_several(len(pairs), 'pair')}, {height} px high and {width} px wide, seed {options.seed}, "
@@ -429,7 +430,8 @@ def _stats(options: argparse.Namespace) -> int:
     with Progress(total=pairs, desc="looking at pairs", unit="pair", disable=None) as bar:
         statistics = source_statistics(stream, pairs, bar.update)
     if options.json is not None:
-        options.json.write_text(json.dumps({name: asdict(row) for name, row in statistics.items()}, indent=2) + "\n", encoding="utf-8")
+        with writing(options.json):
+            options.json.write_text(json.dumps({name: asdict(row) for name, row in statistics.items()}, indent=2) + "\n", encoding="utf-8")
     print("                             disparity, px  share of width    share of pixels     flip   reconstruction of the left image")
     print("source                pairs    mean     max    mean    max   hidden  invented  consist.  abs. error    SSIM  photometric")
     for name, row in statistics.items():
@@ -547,17 +549,6 @@ def _take(stream: ZeroStereoStream, epoch: int, index: int, count: int) -> list[
                 if len(pairs) == count:
                     break
     return pairs
-
-
-def _write_png(path: Path, image: np.ndarray) -> None:
-    """Whole or not at all."""
-    data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
-    partial = path.with_name(path.name + ".partial")
-    try:
-        partial.write_bytes(data)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _several(count: int, noun: str, nouns: str = "") -> str:

@@ -7,6 +7,8 @@ import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from zsdata.source.writing import writing
+
 
 class RejectedFile:
     """Writes source, shard, key, reason, epoch and index of every photo that was refused.
@@ -32,6 +34,7 @@ class RejectedFile:
     def _append(self, line: bytes) -> None:
         file = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o666)
         try:
-            os.write(file, line)
+            with writing(self._path):
+                os.write(file, line)
         finally:
             os.close(file)

@@ -7,7 +7,9 @@ from contextlib import contextmanager
 
 import pytest
 
+from trainers import run_folder
 from zsdata.export import write_whole
+from zsdata.rejected import RejectedFile
 from zsdata.source.compressed import decompress
 from zsdata.source.pack import pack
 
@@ -48,3 +50,20 @@ def test_a_file_that_the_disk_has_no_room_for_is_named_and_removed(photos, tmp_p
         write(tmp_path)
     assert name in str(raised.value.filename)
     assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("append", "line"),
+    [
+        (lambda path: run_folder.append(path, {"step": 1}), '{"step": 1}\n'),
+        (lambda path: RejectedFile(path).add([{"replaced": [("a", "b", "c", "d")], "epoch": 0, "index": 0}]), '{"source": "a"'),
+    ],
+)
+def test_a_list_that_the_disk_has_no_room_for_is_named(tmp_path, append, line):
+    path = tmp_path / "list.jsonl"
+    append(path)
+    assert path.read_text().startswith(line)
+    path.write_bytes(bytes(4096))
+    with pytest.raises(OSError, match="too large") as raised, small_disk():
+        append(path)
+    assert str(raised.value.filename) == str(path)
