@@ -182,6 +182,8 @@ def tune(
 
     faults = FaultLog(FailureBudget(), ranks=accelerator.num_processes, forgiven=[SPARSE_TRUTH])
 
+    termination = Termination()
+
     def refused() -> dict[str, int]:
         """Pairs and photos that could not be used, by reason, of all ranks and since the run began."""
         return dict(sum(gather_object([faults.by_reason]), start=refused_before))
@@ -208,12 +210,22 @@ def tune(
         accelerator.wait_for_everyone()
         return run_folder.folder_of(output, step)
 
+    def end(saved: Path | None) -> NoReturn:
+        if saved is not None:
+            accelerator.print(f"asked to end by SIGTERM: {saved} is saved, and --resume {output} goes on from it")
+        accelerator.end_training()
+        raise Terminated
+
     def validate(checkpoint: Path | None) -> None:
         """Judges a checkpoint, which is kept if it is the best so far; or, with None, the pipeline that the run begins with."""
         nonlocal best
         if not cases:
             return
-        scores = _validate(pipeline / subfolder if checkpoint is None else checkpoint / PIPELINE, cases, config, accelerator)
+        try:
+            with termination.at_once():
+                scores = _validate(pipeline / subfolder if checkpoint is None else checkpoint / PIPELINE, cases, config, accelerator)
+        except Terminated:
+            end(checkpoint)
         mean, note = mean_hole_scores(scores), ""
         if checkpoint is not None and mean["psnr"] > (-math.inf if best is None else best["psnr"]):
             best, note = {"step": step, "psnr": mean["psnr"], "by": judged_by}, ", the best so far"
@@ -224,15 +236,11 @@ def tune(
         if accelerator.is_main_process:
             run_folder.append(output / "validation.jsonl", {"step": step, "mean": mean, "pairs": scores})
 
-    def end(saved: Path) -> NoReturn:
-        accelerator.print(f"asked to end by SIGTERM: {saved} is saved, and --resume {output} goes on from it")
-        accelerator.end_training()
-        raise Terminated
-
-    validate(checkpoint)
+    with termination:
+        validate(checkpoint)
     asked = requests(step, config.steps, config.batch_size, config.micro_batch, accelerator.process_index, accelerator.num_processes)
     progress = Progress(total=config.steps, initial=step, unit="step", disable=not accelerator.is_main_process, dynamic_ncols=True)
-    with Termination() as termination, making(examples, asked, config.workers, accelerator.device) as batches:
+    with termination, making(examples, asked, config.workers, accelerator.device) as batches:
         mark, waited = (step, time.perf_counter()), 0.0
         while step < config.steps:
             skipped = False
@@ -279,12 +287,7 @@ def tune(
             if step < config.steps and termination.asked(accelerator.device):
                 end(save())
             if step % config.save_every == 0 or step == config.steps:
-                saved = save()
-                try:
-                    with termination.at_once():
-                        validate(saved)
-                except Terminated:
-                    end(saved)
+                validate(save())
     progress.close()
     accelerator.print(_summary(refused()))
     folder = run_folder.folder_of(output, step) / PIPELINE

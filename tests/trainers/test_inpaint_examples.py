@@ -435,6 +435,21 @@ def test_a_strip_is_replaced_before_a_depth_network_sees_it_enlarged(tmp_path):
     assert [(key, reason.split(":")[0]) for _, _, key, reason in rejected] == [("strip", "too long for the depth network")]
 
 
+def test_a_crop_of_a_strip_that_is_more_hole_than_picture_is_refused(tmp_path):
+    """The strip is enlarged seven times: what is hidden is wider than the crop."""
+    depth = torch.zeros(1, 1, 32, 1600)
+    depth[..., 800:] = 1
+    refused = 0
+    for index in range(30):
+        try:
+            mask = from_photo(photo(2, 32, 1600), depth, QuarterOfTheWidth(), (224, 96), drawing(index=index)).inpaint_mask
+            assert mask.float().mean() <= 0.5
+        except BadPhoto as fault:
+            assert fault.reason.startswith("too many holes: ")
+            refused += 1
+    assert 0 < refused < 30
+
+
 def test_depth_is_estimated_once_and_a_stream_may_have_done_it(tmp_path):
     tar, calls = photo_tar(tmp_path / "photos.tar", 3, height=64, width=96), []
 

@@ -23,6 +23,8 @@ from torch import Tensor
 
 from trainers.inpaint_data.stored_maps import StereoFrame
 from zsdata.augment import AugmentConfig, augment
+from zsdata.faults import BadPhoto
+from zsdata.quality import QualityGate
 from zsdata.synthesis.disparity import SMALLEST_DISPARITY_PX, AdaptiveDisparity, dilate_disparity, sharpen_disparity
 from zsdata.synthesis.view import ViewConfig
 from zsdata.synthesis.warp import forward_warp
@@ -40,7 +42,7 @@ SYMMETRIC_COLOUR = replace(
     saturation=_JITTER.saturation,
     hue_turns=_JITTER.hue_turns,
 )
-STREAM_VIEW = ViewConfig()  # of the pairs whose holes are to be filled
+STREAM_VIEW, STREAM_GATE = ViewConfig(), QualityGate()  # of the pairs whose holes are to be filled
 
 
 class Example(NamedTuple):
@@ -87,13 +89,17 @@ def from_photo(photo: np.ndarray, inverse_depth: Tensor, scale: AdaptiveDisparit
     """An example of a photo, taken for a right image.
 
     Mirrored half of the time. A photo that is smaller than the crop is enlarged to it; one that is wider than two crops is brought to
-    that width, as in the stream, which makes no wider holes either. The disparity is made as in the stream: dilated and sharpened.
+    that width, as in the stream, which makes no wider holes either. The disparity is made as in the stream: dilated and sharpened. A crop
+    with more holes than the stream lets pass is refused: that of a strip, which was enlarged.
 
     Args:
         photo: uint8 [H, W, 3], RGB.
         inverse_depth: float32 [1, 1, H, W], in [0, 1], larger is nearer.
         scale: draws the disparity of the nearest point.
         size: (height, width) of the crop, in pixels.
+
+    Raises:
+        BadPhoto: too many holes.
     """
     mirror, *place, instead = draw("view").random(4)
     if mirror < 0.5:
@@ -110,6 +116,9 @@ def from_photo(photo: np.ndarray, inverse_depth: Tensor, scale: AdaptiveDisparit
     hidden = hidden_from_left(disparity[..., rows, :])
     columns = _with_hole(columns, hidden, instead)
     inpaint_mask = hidden[..., columns].contiguous()
+    hole_share = float(inpaint_mask.float().mean())
+    if hole_share > STREAM_GATE.max_hole_share:
+        raise BadPhoto(f"too many holes: {hole_share:.0%} of the crop would be invented")
     crop = _image(photo[rows, columns])
     _, right = augment(crop, crop, [draw("augment")], SYMMETRIC_COLOUR)
     return Example(right, right.masked_fill(inpaint_mask, 0), inpaint_mask)
