@@ -243,7 +243,7 @@ def test_a_name_with_a_revision_is_both(tmp_path):
     [
         ("buildin", '"buildin" is neither a folder nor a Hub id'),
         ("/no/such", '"/no/such" is neither a folder nor a Hub id'),
-        ("FOLDER", "is no inpainting pipeline: it lacks unet/, vae/"),
+        ("FOLDER", 'is no inpainting pipeline: it lacks unet/, vae/, .*; ".*/pipeline" may be meant'),
         (DiffusionNetwork("PIPELINE", scheduler="fastest"), 'scheduler is one of .*; got "fastest"'),
         (DiffusionNetwork("PIPELINE", autoencoder="/no/such"), '"/no/such" is neither a folder nor a Hub id'),
         (DiffusionNetwork("PIPELINE", revision="v1"), 'is a folder, which has no revisions; got revision="v1"'),

@@ -44,6 +44,8 @@ class EvaluationSet:
                     f"{spec}: the motorcycle comes with scikit-image and has no folder" if root else f"say where it lies: {name}=DIR"
                 )
             parsed = EvaluationSet(name, dataset, Path(root) if root else None, variant or None)
+        elif root and name != "folder" and not Path(spec).is_dir():
+            raise ValueError(f'{spec}: no data set is called "{dataset}"; there is motorcycle, {", ".join(BENCHMARKS)}, folder')
         else:
             folder = Path(root if name == "folder" else spec)
             parsed = EvaluationSet(folder.resolve().name, "folder", folder)

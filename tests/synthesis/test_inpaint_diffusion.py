@@ -707,13 +707,17 @@ def test_weights_of_another_size_are_named(copy):
         load_inpainter(copy)
 
 
-def test_weights_in_half_precision_alone_are_found(copy, inpainter):
+def test_weights_in_half_precision_alone_are_found_and_no_other_ones_are_missed(copy, inpainter, caplog):
     for part in ("unet", "vae", "text_encoder"):
         path = next((copy / part).glob("*.safetensors"))
         save_file({name: weight.half() for name, weight in load_file(path).items()}, path, metadata={"format": "pt"})
         path.rename(path.with_name(path.name.replace(".safetensors", ".fp16.safetensors")))
     right, inpaint_mask = scenes(1)
+    logger = logging.getLogger("diffusers")  # hands nothing on to the root
+    logger.addHandler(caplog.handler)
     made = load_inpainter(copy, steps=3)(right, inpaint_mask, generators(0))
+    logger.removeHandler(caplog.handler)
+    assert not caplog.records
     assert 0 < (made - inpainter(right, inpaint_mask, generators(0))).abs().mean() < 1
 
 

@@ -38,7 +38,8 @@ def test_a_spec_names_a_benchmark_its_variant_and_its_folder(tmp_path):
         ("motorcycle={root}", ValueError, "motorcycle.*no folder"),
         ("eth3d=nowhere", FileNotFoundError, "no folder nowhere"),
         ("folder=nowhere", FileNotFoundError, "no folder nowhere"),
-        ("kitty=nowhere", FileNotFoundError, "no folder kitty=nowhere"),
+        ("nowhere", FileNotFoundError, "no folder nowhere"),
+        ("kitty=nowhere", ValueError, 'no data set is called "kitty"; there is motorcycle, kitti2012, .*, folder'),
     ],
 )
 def test_a_spec_that_cannot_be_opened_is_refused_at_once(tmp_path, spec, error, message):

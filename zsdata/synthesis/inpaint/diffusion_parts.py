@@ -6,9 +6,11 @@ fixed, and so are the classes. Weights come from safetensors alone, since pickle
 
 from __future__ import annotations
 
+import logging
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -173,7 +175,8 @@ def _load_weights(network: Any, name: str, subfolder: str, part: str, revision: 
     options |= {"use_safetensors": True, "output_loading_info": True}
     with torch.random.fork_rng(devices=[]):  # older transformers fill the weights with random numbers first
         try:
-            loaded, report = _load(network.from_pretrained, name, subfolder, part, revision, **options)
+            with _unsaid("error occurred while trying to fetch"):
+                loaded, report = _load(network.from_pretrained, name, subfolder, part, revision, **options)
         except OSError as error:
             try:
                 loaded, report = _load(network.from_pretrained, name, subfolder, part, revision, variant="fp16", **options)
@@ -186,6 +189,21 @@ def _load_weights(network: Any, name: str, subfolder: str, part: str, revision: 
             "diffusers and transformers: a text encoder saved by transformers 5 has names that older ones do not know"
         )
     return loaded.eval().requires_grad_(False)
+
+
+@contextmanager
+def _unsaid(words: str) -> Iterator[None]:
+    """Keeps back what diffusers logs of weights that are not there; they may be there under another name, and if not, the error says it."""
+
+    def others(record: logging.LogRecord) -> bool:
+        return words not in record.getMessage()
+
+    logger = logging.getLogger("diffusers.models.modeling_utils")
+    logger.addFilter(others)
+    try:
+        yield
+    finally:
+        logger.removeFilter(others)
 
 
 def _check_unet(name: str, config: Mapping[str, Any]) -> None:
@@ -226,9 +244,10 @@ def _check_folder(network: DiffusionNetwork) -> None:
     needed = weighted + [Path(name, subfolder, part) for part in OTHER_PARTS]
     if os.path.isdir(name):
         if missing := [path.name for path in needed if not path.is_dir()]:
+            deeper = sorted(path.parent for path in Path(name, subfolder).glob("*/unet"))
+            cure = f'"{deeper[0]}" may be meant' if deeper else "if the pipeline lies deeper in the folder, name its `subfolder`"
             raise FileNotFoundError(
-                f'"{Path(name, subfolder)}" is no inpainting pipeline: it lacks {", ".join(f"{part}/" for part in missing)}. '
-                "If the pipeline lies deeper in the folder, name its `subfolder`."
+                f'"{Path(name, subfolder)}" is no inpainting pipeline: it lacks {", ".join(f"{part}/" for part in missing)}; {cure}'
             )
     else:
         weighted = []
