@@ -251,7 +251,8 @@ class ZeroStereoStream(IterableDataset):
         self._loop_is_open = False
 
     def set_sources(self, sources: Any, *, epoch: int) -> None:
-        """Uses other sources from `epoch` on; loaders follow by themselves.
+        """Uses other sources from `epoch` on; loaders follow by themselves. A torch `DataLoader`'s workers do when they are started anew,
+        so not with `persistent_workers=True`.
 
         A state saved afterwards belongs to the stream with this swap in it: before resuming, swap again or give the schedule
         {0: ..., epoch: ...} from the start.
