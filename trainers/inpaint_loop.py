@@ -12,7 +12,7 @@ import time
 from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NoReturn, cast
+from typing import Any, cast
 
 import torch
 from accelerate import Accelerator
@@ -30,7 +30,7 @@ from trainers.noise_prediction import NoisePrediction
 from trainers.pairs_on_disk import StereoPair
 from trainers.pipeline_folder import UNET, frozen_digest, write_pipeline
 from trainers.step_guard import StepGuard
-from trainers.termination import Terminated, Termination
+from trainers.termination import Terminated, Termination, end
 from trainers.weight_average import WeightAverage, weights_of
 from zsdata.faults import FailureBudget, FaultLog
 from zsdata.position import Position, require_one_place
@@ -210,12 +210,6 @@ def tune(
         accelerator.wait_for_everyone()
         return run_folder.folder_of(output, step)
 
-    def end(saved: Path | None) -> NoReturn:
-        if saved is not None:
-            accelerator.print(f"asked to end by SIGTERM: {saved} is saved, and --resume {output} goes on from it")
-        accelerator.end_training()
-        raise Terminated
-
     def validate(checkpoint: Path | None) -> None:
         """Judges a checkpoint, which is kept if it is the best so far; or, with None, the pipeline that the run begins with."""
         nonlocal best
@@ -225,7 +219,7 @@ def tune(
             with termination.at_once():
                 scores = _validate(pipeline / subfolder if checkpoint is None else checkpoint / PIPELINE, cases, config, accelerator)
         except Terminated:
-            end(checkpoint)
+            end(accelerator, checkpoint, output)
         mean, note = mean_hole_scores(scores), ""
         if checkpoint is not None and mean["psnr"] > (-math.inf if best is None else best["psnr"]):
             best, note = {"step": step, "psnr": mean["psnr"], "by": judged_by}, ", the best so far"
@@ -285,7 +279,7 @@ def tune(
                     run_folder.append(output / "log.jsonl", {"step": step, **values, "refused": reasons})
                 accelerator.log({**values, "refused": sum(reasons.values())}, step=step)
             if step < config.steps and termination.asked(accelerator.device):
-                end(save())
+                end(accelerator, save(), output)
             if step % config.save_every == 0 or step == config.steps:
                 validate(save())
     progress.close()

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
-from typing import Any, NoReturn, cast
+from typing import Any, cast
 
 import torch
 from accelerate.tracking import GeneralTracker
@@ -23,7 +23,7 @@ from trainers.models.checkpoint import WEIGHTS_FILE
 from trainers.provenance import provenance
 from trainers.ranks import mean_over_ranks
 from trainers.step_guard import StepGuard
-from trainers.termination import Terminated, Termination
+from trainers.termination import Terminated, Termination, end
 from trainers.validation import BEST_BY, EvaluationSet, Validation
 from trainers.weight_average import WeightAverage, weights_of
 from zsdata import StereoBatch, ZeroStereoStream
@@ -208,11 +208,6 @@ def train(
         accelerator.wait_for_everyone()
         return folder
 
-    def end(saved: Path) -> NoReturn:
-        accelerator.print(f"asked to end by SIGTERM: {saved} is saved, and --resume {output} goes on from it")
-        accelerator.end_training()
-        raise Terminated
-
     def is_to_be_judged() -> bool:
         """Whether it is this step's turn, the last one's aside."""
         every = config.evaluate_every
@@ -231,7 +226,7 @@ def train(
                     "with --corr-implementation alt (RAFT-Stereo), with smaller images for --evaluate, or without it",
                 )
         except Terminated:
-            end(saved)
+            end(accelerator, saved, output)
         best = validation.is_best(results, step)
         if accelerator.is_main_process:
             _write_scores(output, step, results, validation)
@@ -308,7 +303,7 @@ def train(
                 if step == config.steps:
                     break
                 if termination.asked(accelerator.device):
-                    end(save())
+                    end(accelerator, save(), output)
                 if is_to_be_judged():
                     results = judge(save())
                 elif step % config.save_every == 0:

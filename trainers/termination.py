@@ -6,10 +6,12 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
+from accelerate import Accelerator
 
 from trainers.ranks import on_any_rank
 
@@ -19,6 +21,14 @@ class Terminated(SystemExit):
 
     def __init__(self) -> None:
         super().__init__(128 + signal.SIGTERM)
+
+
+def end(accelerator: Accelerator, saved: Path | None, output: Path) -> NoReturn:
+    """Ends a training that was asked to, on all ranks; `saved` is its last checkpoint, if it has one yet."""
+    if saved is not None:
+        accelerator.print(f"asked to end by SIGTERM: {saved} is saved, and --resume {output} goes on from it")
+    accelerator.end_training()
+    raise Terminated
 
 
 class Termination:
